@@ -1,0 +1,1 @@
+"""From files on disk to calibrated silhouettes (numpy, OpenCV, pycolmap; never JAX)."""

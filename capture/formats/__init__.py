@@ -1,0 +1,1 @@
+"""Other people's calibration formats, one file each: the only place that knows their conventions."""

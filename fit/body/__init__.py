@@ -1,0 +1,1 @@
+"""Body models: the licence-free body's generator, model files, skinning."""
