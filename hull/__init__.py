@@ -1,1 +1,1 @@
-"""From silhouettes to a closed surface: one scan a frame (never JAX at import)."""
+"""From silhouettes to a closed surface: one scan a frame."""

@@ -1,0 +1,109 @@
+"""Where to carve: a box around the person, found from the cameras and silhouettes alone.
+
+A coarse carve of all space that the cameras could mean, in which (from four silhouettes on) a place is given up only
+when two cameras see background there, so that one bad silhouette cannot cut the box short.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from capture.camera import Camera
+from hull.carve import Grid, touched_box
+from hull.diagnosis import why_empty
+from hull.errors import HullError
+from hull.tables import BLOCK_PX, INSIDE, SilhouetteTable, prepare_tables
+from hull.witnesses import witness_rule
+
+# The box is found to this fraction of the cameras' distance (3 cm at 4 m) ...
+_DEPTH_OF_SEARCH = 8
+# ... and widened by this, so that the surface never touches its sides.
+PADDING_M = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """An axis-aligned box: `low` (3,) and `high` (3,), world metres."""
+
+    low: Float[np.ndarray, " 3"]
+    high: Float[np.ndarray, " 3"]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "low", np.array(self.low, dtype=np.float64))
+        object.__setattr__(self, "high", np.array(self.high, dtype=np.float64))
+        if self.low.shape != (3,) or self.high.shape != (3,) or not (self.high > self.low).all():
+            raise HullError(f"bounds from {self.low.tolist()} to {self.high.tolist()} m enclose no space")
+
+    @property
+    def centre(self) -> Float[np.ndarray, " 3"]:
+        return 0.5 * (self.low + self.high)
+
+    @property
+    def size_m(self) -> Float[np.ndarray, " 3"]:
+        return self.high - self.low
+
+
+def find_bounds(rig: Iterable[Camera], images: Sequence[np.ndarray | None]) -> Bounds:
+    """The box around the hull of these silhouettes (per camera (h w) uint8 or None), world metres.
+
+    Raises HullError when no space fits the silhouettes, naming the camera that empties it if it is one alone.
+    """
+    return bounds_from_tables(prepare_tables(rig, images))
+
+
+def bounds_from_tables(tables: Sequence[SilhouetteTable]) -> Bounds:
+    """`find_bounds` for silhouettes that are prepared already."""
+    subject = meeting_point(tables)
+    rule = witness_rule(tables, subject)
+    distances = np.linalg.norm([table.centre - subject for table in tables], axis=1)
+    # The person is nearer to the meeting point than the farthest camera is: further out a rig sees nothing usable.
+    reach = float(distances.max())
+    n = 1 << _DEPTH_OF_SEARCH
+    grid = Grid(subject - reach, 2 * reach / n, (n, n, n))
+    box = touched_box(tables, rule, grid, votes=2 if len(tables) >= 4 else 1)
+    if box is None:
+        raise HullError(why_empty(tables, rule, Bounds(subject - reach, subject + reach)))
+    return Bounds(box[0] - PADDING_M, box[1] + PADDING_M)
+
+
+def meeting_point(tables: Sequence[SilhouetteTable]) -> Float[np.ndarray, " 3"]:
+    """The point (3,) nearest to the rays through the silhouettes' centroids; a few stray rays do not move it.
+
+    Least absolute distances by reweighting. Raises HullError when fewer than two silhouettes show anything.
+    """
+    origins, directions = [], []
+    for table in tables:
+        if (ray := _central_ray(table)) is not None:
+            origins.append(table.centre)
+            directions.append(ray)
+    if len(origins) < 2:
+        empty = [table.name for table in tables if _central_ray(table) is None]
+        which = f" (empty: {', '.join(empty)})" if empty else ""
+        raise HullError(f"{len(origins)} of {len(tables)} silhouettes show anything{which}; a hull needs at least 2")
+    origin, direction = np.array(origins), np.array(directions)
+    across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
+    weight = np.ones(len(origin))
+    point = origin.mean(axis=0)
+    for _ in range(20):
+        normal = np.einsum("c,cij->ij", weight, across)
+        point = np.linalg.lstsq(normal, np.einsum("c,cij,cj->i", weight, across, origin), rcond=None)[0]
+        distance = np.linalg.norm(np.einsum("cij,cj->ci", across, point - origin), axis=1)
+        weight = 1.0 / np.maximum(distance, 0.02)
+    return point
+
+
+def _central_ray(table: SilhouetteTable) -> Float[np.ndarray, " 3"] | None:
+    """Unit direction (3,) through the middle of the silhouette's solid part, or of any part if it is thin."""
+    classes = table.squares[0]
+    rows, columns = np.nonzero(classes == INSIDE)
+    if not len(rows):
+        rows, columns = np.nonzero((classes & INSIDE != 0) & (classes < 4))
+    if not len(rows):
+        return None
+    pixel = (np.array([columns.mean(), rows.mean()]) + 0.5) * BLOCK_PX + np.array(table.origin)
+    direction = np.linalg.solve(table.projection[:, :3], np.append(pixel, 1.0))
+    return direction / np.linalg.norm(direction)

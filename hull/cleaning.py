@@ -1,0 +1,132 @@
+"""What to keep of a raw surface: checked, free of specks and of pieces that no silhouette needs.
+
+A visual hull is the largest shape that fits the silhouettes, so where limbs cross in the pictures it holds phantom
+pieces with nothing in them. A separate piece is kept if it is the largest, or if some picture would lose something
+without it (a hand that the grid cut off, a thrown ball); see "safe hulls", Miller and Hilton.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from hull.tables import INSIDE, SilhouetteTable
+
+# Below this share of the largest piece's volume a piece is a speck, whatever it covers (5 cm^3 of a person).
+SPECK_SHARE = 1e-4
+# A piece is needed if in some camera this share of its points is covered by it alone.
+_NEEDED_SHARE = 0.1
+
+
+def keep_what_matters(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], tables: Sequence[SilhouetteTable]
+) -> tuple[Float[np.ndarray, "v2 3"], Int[np.ndarray, "f2 3"], tuple[str, ...]]:
+    """Vertices, faces and one sentence for each kind of thing that was left out."""
+    label = face_pieces(faces, len(vertices))
+    volumes = piece_volumes(vertices, faces, label)
+    if len(volumes) == 1:
+        return vertices, faces, ()
+    largest = int(np.argmax(volumes))
+    keep = np.zeros(len(volumes), dtype=bool)
+    keep[largest] = True
+    # Negative volumes are hollows: complements of cones leave none in a hull, only the grid can.
+    candidates = np.flatnonzero((volumes > SPECK_SHARE * volumes[largest]) & ~keep)
+    phantoms = []
+    if len(candidates):
+        scene = _scene(vertices, faces[label == largest])
+        for piece in candidates:
+            corners = vertices[np.unique(faces[label == piece])]
+            if _is_needed(corners, scene, tables):
+                keep[piece] = True
+            else:
+                phantoms.append(volumes[piece])
+    vertices, faces = compacted(vertices, faces[keep[label]])
+    notes = []
+    if phantoms:
+        notes.append(f"left out {len(phantoms)} separate pieces ({sum(phantoms) * 1000:.2f} L) that no silhouette needs")
+    if keep.sum() > 1:
+        parts = ", ".join(f"{volume * 1000:.2f} L" for volume in sorted(volumes[keep], reverse=True))
+        notes.append(f"the hull is in {keep.sum()} separate pieces ({parts})")
+    return vertices, faces, tuple(notes)
+
+
+def face_pieces(faces: Int[np.ndarray, "f 3"], n_vertices: int) -> Int[np.ndarray, " f"]:
+    """(F,) number, from 0, of the connected piece each face belongs to."""
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    graph = coo_array((np.ones(len(ends), dtype=bool), (ends[:, 0], ends[:, 1])), shape=(n_vertices, n_vertices))
+    _, of_vertex = connected_components(graph.tocsr(), directed=False)
+    return np.unique(of_vertex[faces[:, 0]], return_inverse=True)[1].ravel()
+
+
+def piece_volumes(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], label: Int[np.ndarray, " f"]
+) -> Float[np.ndarray, " p"]:
+    """Signed volume, cubic metres, of each closed piece; positive where the faces look outward."""
+    a, b, c = (vertices[faces[:, k]] - vertices.mean(axis=0) for k in range(3))
+    return np.bincount(label, np.einsum("fi,fi->f", a, np.cross(b, c)) / 6.0)
+
+
+def compacted(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> tuple[Float[np.ndarray, "v2 3"], Int[np.ndarray, "f 3"]]:
+    """The same faces without the vertices that none of them uses."""
+    used = np.zeros(len(vertices), dtype=bool)
+    used[faces.ravel()] = True
+    return vertices[used], (np.cumsum(used) - 1)[faces]
+
+
+def vertex_normals(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> Float[np.ndarray, "v 3"]:
+    """(V 3) unit outward normals: the faces' normals, weighted by their angle at the vertex.
+
+    By angle and not by area, because marching cubes makes slivers beside large triangles.
+    """
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    sums = np.zeros_like(vertices)
+    for k in range(3):
+        one = corners[:, (k + 1) % 3] - corners[:, k]
+        two = corners[:, (k + 2) % 3] - corners[:, k]
+        angle = np.arctan2(np.linalg.norm(np.cross(one, two), axis=1), np.einsum("fi,fi->f", one, two))
+        for axis in range(3):
+            sums[:, axis] += np.bincount(faces[:, k], angle * normal[:, axis], minlength=len(vertices))
+    return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-30)
+
+
+def is_closed(faces: Int[np.ndarray, "f 3"], n_vertices: int) -> bool:
+    """True if every edge is used exactly once in each direction: watertight and consistently oriented."""
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    forth = np.sort(ends[:, 0] * n_vertices + ends[:, 1])
+    back = np.sort(ends[:, 1] * n_vertices + ends[:, 0])
+    return bool(len(faces)) and np.array_equal(forth, back) and not (forth[1:] == forth[:-1]).any()
+
+
+def _is_needed(corners: Float[np.ndarray, "n 3"], scene: object, tables: Sequence[SilhouetteTable]) -> bool:
+    import open3d as o3d
+
+    for table in tables:
+        seen = table.ask_points(corners.T) == INSIDE
+        if not seen.any():
+            continue
+        ways = (corners[seen] - table.centre).astype(np.float32)
+        rays = np.concatenate([np.broadcast_to(table.centre.astype(np.float32), ways.shape), ways], axis=1)
+        covered = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].isfinite().numpy()  # type: ignore[attr-defined]
+        if (~covered).mean() > _NEEDED_SHARE:
+            return True
+    return False
+
+
+def _scene(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> object:
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(
+        o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32))
+    )
+    return scene

@@ -1,0 +1,95 @@
+"""Why a hull came out empty, in a sentence that names the cameras.
+
+Leaving each camera out in turn: if the others agree on something, that camera is the one to look at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from hull.carve import Grid, carve
+from hull.tables import INSIDE, NO_EVIDENCE, OUTSIDE, SilhouetteTable
+from hull.witnesses import WitnessRule
+
+_N_ACROSS = 128
+
+
+class Box(Protocol):
+    """Anything with a low and a high corner (3,), metres."""
+
+    @property
+    def low(self) -> Float[np.ndarray, " 3"]: ...
+    @property
+    def high(self) -> Float[np.ndarray, " 3"]: ...
+
+
+def why_empty(tables: Sequence[SilhouetteTable], rule: WitnessRule, box: Box) -> str:
+    """The sentence for the user. `box`: where it was looked."""
+    blank = [table.name for table in tables if not (table.squares[0] & INSIDE).any()]
+    unclear = [table.name for table in tables if (table.squares[0] == NO_EVIDENCE).all()]
+    blank = [name for name in blank if name not in unclear]
+    if blank:
+        return f"the silhouettes of {_listed(blank)} show nobody, so nothing is left; leave them out (None) or redo them"
+    spared = volumes_without_each(tables, rule, box)
+    culprit = int(np.argmax(spared))
+    if spared[culprit] > 0:
+        others = np.delete(spared, culprit)
+        alone = others.max(initial=0.0) < 0.5 * spared[culprit]
+        rest = f"what the other {len(tables) - 1} cameras agree on ({spared[culprit] * 1000:.0f} L)"
+        if alone:
+            return (
+                f"camera {tables[culprit].name} leaves nothing of {rest}; "
+                "look at its silhouette and its calibration, or leave it out"
+            )
+        several = [tables[i].name for i in np.argsort(-spared, kind="stable")[:3] if spared[i] > 0]
+        return f"the silhouettes have no space in common; leaving out one of {_listed(several)} would leave some"
+    return (
+        f"the silhouettes of the {len(tables)} cameras have no space in common, even without any single one of them; "
+        "do the calibration and the pictures belong together (units, picture size, order of the cameras)?"
+    )
+
+
+def volumes_without_each(tables: Sequence[SilhouetteTable], rule: WitnessRule, box: Box) -> Float[np.ndarray, " c"]:
+    """(C,) volume, cubic metres, of the hull that is left when each camera is left out; coarse.
+
+    One carve with two votes holds everything that any single camera empties; its voxels are then asked once more.
+    """
+    extent = np.asarray(box.high) - np.asarray(box.low)
+    voxel_m = float(extent.max()) / _N_ACROSS
+    nx, ny, nz = (max(int(np.ceil(e / voxel_m)), 1) for e in extent)
+    blocks = carve(tables, rule, Grid(np.asarray(box.low), voxel_m, (nx, ny, nz)), votes=2)
+    if not blocks.n_voxels:
+        return np.zeros(len(tables))
+    first, end = blocks.span()
+    cells = np.stack(np.nonzero(blocks.dense(first, end))) + first[:, None]
+    answers = answers_of_all(tables, blocks.grid.centres(cells))
+    refused = answers == OUTSIDE
+    by_one_only = refused.sum(axis=0) == 1
+    by_none = (~refused.any(axis=0)).sum()
+    return (by_none + (refused & by_one_only).sum(axis=1)) * voxel_m**3
+
+
+def answers_of_all(
+    tables: Sequence[SilhouetteTable], points: Float[np.ndarray, "3 n"]
+) -> UInt8[np.ndarray, "c n"]:
+    """(C N) every camera's answer for every point (3 N): the plain definition that carving has to reproduce."""
+    return np.stack([table.ask_points(points) for table in tables])
+
+
+def inside_by_definition(
+    tables: Sequence[SilhouetteTable], rule: WitnessRule, points: Float[np.ndarray, "3 n"], votes: int = 1
+) -> Bool[np.ndarray, " n"]:
+    """(N,) the hull's definition at points (3 N), without any shortcut; slow."""
+    answers = answers_of_all(tables, points)
+    sets = np.zeros((len(rule.full()), points.shape[1]), dtype=np.uint64)
+    for camera in range(len(tables)):
+        sets[camera // 64] |= (answers[camera] == INSIDE).astype(np.uint64) << np.uint64(camera % 64)
+    return ((answers == OUTSIDE).sum(axis=0) < votes) & rule.enough(sets)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(f"camera {name}" for name in names)

@@ -1,0 +1,5 @@
+"""The one exception of this room."""
+
+
+class HullError(ValueError):
+    """No hull can be made of what was given: one or two sentences that say why and what to do."""

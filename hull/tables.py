@@ -1,0 +1,287 @@
+"""A silhouette prepared for carving: quick answers about points and about whole cells.
+
+Step: section 4 of Zhang et al. 2017 takes visual hulls as given scans; this is the image side of making them. One
+predicate defines the hull everywhere in this package: the binary silhouette, interpolated bilinearly at the
+projection of a point, is at least one half. It is answered in two ways that agree exactly:
+
+- for a point, from the *codes*: one byte a pixel that packs the 2 x 2 pixels around it, so that a single look-up
+  decides all but the points within a pixel of the outline;
+- for a cell, from the *classes*: quarter-size blocks of codes, each marked with the set of answers found in it, OR-ed
+  over squares of 1, 2, 4, ... blocks, so that four look-ups give every answer that occurs in a rectangle.
+
+Sparse OR tables were chosen over summed areas because they carry three kinds of answer in one byte a block, and over a
+pyramid because their squares start at any block, which keeps the rectangle tight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from capture.camera import Camera
+from hull.errors import HullError
+
+# Sets of answers are OR-ed together; a set of one element is a decision.
+INSIDE = 1
+OUTSIDE = 2
+NO_EVIDENCE = 4
+UNDECIDED = INSIDE | OUTSIDE | NO_EVIDENCE
+
+PERSON, BACKGROUND, UNKNOWN = 255, 0, 128
+
+BLOCK_PX = 4
+# What segmentation says of the outermost pixels cannot be trusted: there is no picture beyond them to compare with.
+BORDER_PX = 2
+# Squares of up to 2**MAX_LEVEL blocks; larger rectangles (over 2 * 128 px wide) are undecided in practice anyway.
+MAX_LEVEL = 5
+
+_UNKNOWN_BIT = 16
+
+
+@dataclass(frozen=True, eq=False)
+class SilhouetteTable:
+    """One camera's silhouette, ready to be asked. Pixels are the camera's; pixel (0, 0) is a pixel's centre.
+
+    Fields
+    ------
+    camera_idx : place of the camera in its rig.
+    name : the camera's name.
+    projection : (3 4), px from world, third value the depth.
+    centre : (3,) where the camera stands, world.
+    lowest, highest : the first and the last code (column, row) that holds evidence.
+    origin : (column, row) of the first code stored; what lies beyond the stored ones equals the nearest stored one.
+    codes : (h w) bits 0 to 3: person at the pixel, its right, its lower, its lower right neighbour; bit 4: unknown.
+    squares : (levels h/4 w/4) sets of answers in the square of 2**level blocks that starts at a block.
+    """
+
+    camera_idx: int
+    name: str
+    projection: Float[np.ndarray, "3 4"]
+    centre: Float[np.ndarray, " 3"]
+    lowest: tuple[int, int]
+    highest: tuple[int, int]
+    origin: tuple[int, int]
+    codes: UInt8[np.ndarray, "h w"]
+    squares: UInt8[np.ndarray, "levels hb wb"]
+
+    def ask_points(self, points: Float[np.ndarray, "3 n"]) -> UInt8[np.ndarray, " n"]:
+        """INSIDE, OUTSIDE or NO_EVIDENCE for each world point. Points are columns: (3 N), metres."""
+        u, v, in_front = self._pixels(points)
+        # Far-off pixels are all the same to us; clipping keeps them inside the integers' range.
+        column = np.floor(np.clip(u, -4.0, self.highest[0] + 4.0))
+        row = np.floor(np.clip(v, -4.0, self.highest[1] + 4.0))
+        seen = in_front & (column >= self.lowest[0]) & (column <= self.highest[0])
+        seen &= (row >= self.lowest[1]) & (row <= self.highest[1])
+        height, width = self.codes.shape
+        x = np.clip(column.astype(np.int64) - self.origin[0], 0, width - 1)
+        y = np.clip(row.astype(np.int64) - self.origin[1], 0, height - 1)
+        codes = self.codes.ravel().take(y * width + x)
+        answers = _ANSWER_OF_CODE[codes]
+        outline = np.flatnonzero(answers == UNDECIDED)
+        if len(outline):
+            fx = u[outline] - column[outline]
+            fy = v[outline] - row[outline]
+            bits = codes[outline]
+            upper = (bits & 1) * (1.0 - fx) + ((bits >> 1) & 1) * fx
+            lower = ((bits >> 2) & 1) * (1.0 - fx) + ((bits >> 3) & 1) * fx
+            value = upper * (1.0 - fy) + lower * fy
+            answers[outline] = np.where(value >= 0.5, np.uint8(INSIDE), np.uint8(OUTSIDE))
+        answers[~seen] = NO_EVIDENCE
+        return answers
+
+    def ask_cells(self, centres: Float[np.ndarray, "3 n"], half_m: float) -> UInt8[np.ndarray, " n"]:
+        """The set of answers that can occur in each cube of half side `half_m` around the centres (3 N), metres.
+
+        A superset: a set of one element is certain, a larger one means "split and ask again". The bound on how far a
+        cube reaches in the picture is the exact one for a projective map with a single division (reference 6b).
+        """
+        p = self.projection
+        u, v, depth = p[:, :3] @ centres + p[:, 3:]
+        reach_depth = half_m * np.abs(p[2, :3]).sum()
+        nearest = depth - reach_depth
+        in_front = nearest > 0.0
+        safe_depth = np.where(in_front, depth, 1.0)
+        u /= safe_depth
+        v /= safe_depth
+        per_depth = half_m / np.where(in_front, nearest, 1.0)
+        # The slack covers rounding: a corner that falls on a pixel's edge must be found on either side of it.
+        reach_u = per_depth * sum(np.abs(p[0, k] - u * p[2, k]) for k in range(3)) + 1e-6
+        reach_v = per_depth * sum(np.abs(p[1, k] - v * p[2, k]) for k in range(3)) + 1e-6
+        column_0, column_1 = self._clipped(u - reach_u, 0), self._clipped(u + reach_u, 0)
+        row_0, row_1 = self._clipped(v - reach_v, 1), self._clipped(v + reach_v, 1)
+
+        answers = self._answers_in(column_0, column_1, row_0, row_1)
+        within = (column_0 >= self.lowest[0]) & (column_1 <= self.highest[0])
+        within &= (row_0 >= self.lowest[1]) & (row_1 <= self.highest[1])
+        if not within.all():
+            answers[~within] |= NO_EVIDENCE
+            beyond = (column_1 < self.lowest[0]) | (column_0 > self.highest[0])
+            beyond |= (row_1 < self.lowest[1]) | (row_0 > self.highest[1])
+            answers[beyond] = NO_EVIDENCE
+        if not in_front.all():
+            answers[~in_front] = np.where(depth[~in_front] + reach_depth <= 0.0, NO_EVIDENCE, UNDECIDED)
+        return answers
+
+    def _pixels(
+        self, points: Float[np.ndarray, "3 n"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], np.ndarray]:
+        u, v, depth = self.projection[:, :3] @ points + self.projection[:, 3:]
+        in_front = depth > 0.0
+        safe_depth = depth if in_front.all() else np.where(in_front, depth, 1.0)
+        return u / safe_depth, v / safe_depth, in_front
+
+    def _clipped(self, pixel: Float[np.ndarray, " n"], axis: int) -> np.ndarray:
+        return np.floor(np.clip(pixel, -4.0, self.highest[axis] + 4.0)).astype(np.int64)
+
+    def _answers_in(
+        self, column_0: np.ndarray, column_1: np.ndarray, row_0: np.ndarray, row_1: np.ndarray
+    ) -> UInt8[np.ndarray, " n"]:
+        """The OR of all blocks that rectangles of codes touch, as four overlapping squares of one level."""
+        levels, height, width = self.squares.shape
+        x_0 = np.clip((column_0 - self.origin[0]) >> 2, 0, width - 1)
+        x_1 = np.clip((column_1 - self.origin[0]) >> 2, 0, width - 1)
+        y_0 = np.clip((row_0 - self.origin[1]) >> 2, 0, height - 1)
+        y_1 = np.clip((row_1 - self.origin[1]) >> 2, 0, height - 1)
+        side = np.maximum(x_1 - x_0, y_1 - y_0) + 1
+        level = _LEVEL_OF_SIDE.take(np.minimum(side, len(_LEVEL_OF_SIDE) - 1))
+        too_large = level >= levels
+        level = np.minimum(level, levels - 1)
+        reach = (1 << level) - 1
+        # A square wider than the rectangle starts further left or up: it then covers more, which is still safe.
+        x_1 = np.maximum(x_1 - reach, 0)
+        y_1 = np.maximum(y_1 - reach, 0)
+        flat = self.squares.ravel()
+        upper = (level * height + y_0) * width
+        lower = (level * height + y_1) * width
+        answers = flat.take(upper + x_0) | flat.take(upper + x_1) | flat.take(lower + x_0) | flat.take(lower + x_1)
+        answers[too_large] = UNDECIDED
+        return answers
+
+
+def prepare_tables(rig: Iterable[Camera], images: Sequence[np.ndarray | None]) -> tuple[SilhouetteTable, ...]:
+    """One table for each camera that has a silhouette, in the rig's order.
+
+    `images`: per camera a (h w) uint8 silhouette as the camera's pinhole sees it (255 person, 0 background, 128
+    unknown) or None (no evidence). Raises HullError naming the camera when counts, sizes or types disagree.
+    """
+    cameras = tuple(rig)
+    if len(cameras) != len(images):
+        raise HullError(f"{len(cameras)} cameras but {len(images)} silhouettes; give one (or None) per camera, in order")
+    return tuple(
+        prepare_table(camera, image, camera_idx)
+        for camera_idx, (camera, image) in enumerate(zip(cameras, images, strict=True))
+        if image is not None
+    )
+
+
+def prepare_table(camera: Camera, image: UInt8[np.ndarray, "h w"], camera_idx: int) -> SilhouetteTable:
+    """The table of one silhouette. Only the silhouette's own surroundings are stored. Raises HullError as above."""
+    width, height = camera.size
+    if image.dtype != np.uint8 or image.shape != (height, width):
+        raise HullError(
+            f"camera {camera.name}: its silhouette is {image.dtype} of shape {image.shape}, expected uint8 of shape "
+            f"({height}, {width}) as the calibration says; were the pictures scaled, or the cameras mixed up?"
+        )
+    pixels, origin = _surroundings(image)
+    codes = _codes(pixels)
+    projection = np.asarray(camera.projection_matrix, dtype=np.float64)
+    return SilhouetteTable(
+        camera_idx=camera_idx,
+        name=camera.name,
+        projection=projection,
+        centre=-np.linalg.solve(projection[:, :3], projection[:, 3]),
+        lowest=(BORDER_PX, BORDER_PX),
+        highest=(width - 2 - BORDER_PX, height - 2 - BORDER_PX),
+        origin=origin,
+        codes=codes,
+        squares=_squares(_classes(codes)),
+    )
+
+
+def _surroundings(image: UInt8[np.ndarray, "h w"]) -> tuple[UInt8[np.ndarray, "h2 w2"], tuple[int, int]]:
+    """The part of the picture around what is not background, one clear block wide, and its (column, row).
+
+    Beyond the picture and in its border pixels it is UNKNOWN. One pixel more than whole blocks in both directions.
+    """
+    height, width = image.shape
+    x, y, w, h = cv2.boundingRect(image)
+    if w == 0:
+        x, y, w, h = width // 2, height // 2, 1, 1
+    x_0 = (x - 1) // BLOCK_PX * BLOCK_PX - BLOCK_PX
+    y_0 = (y - 1) // BLOCK_PX * BLOCK_PX - BLOCK_PX
+    x_1 = (x + w) // BLOCK_PX * BLOCK_PX + 2 * BLOCK_PX + 1
+    y_1 = (y + h) // BLOCK_PX * BLOCK_PX + 2 * BLOCK_PX + 1
+    pixels = np.full((y_1 - y_0, x_1 - x_0), UNKNOWN, dtype=np.uint8)
+    from_x, to_x = max(x_0, BORDER_PX), min(x_1, width - BORDER_PX)
+    from_y, to_y = max(y_0, BORDER_PX), min(y_1, height - BORDER_PX)
+    if to_x > from_x and to_y > from_y:
+        pixels[from_y - y_0 : to_y - y_0, from_x - x_0 : to_x - x_0] = image[from_y:to_y, from_x:to_x]
+    return pixels, (x_0, y_0)
+
+
+def _codes(pixels: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h-1 w-1"]:
+    """(h w) pixels -> (h-1 w-1) codes of their 2 x 2 neighbourhoods."""
+    bits = (pixels > UNKNOWN).view(np.uint8)
+    unknown = pixels == UNKNOWN
+    if unknown.any():
+        bits |= unknown.view(np.uint8) << 4
+    # The unknown bit must not wander when the person bits are shifted, so it is OR-ed in separately below.
+    person = bits & 1
+    codes = person[:-1, :-1] | (person[:-1, 1:] << 1)
+    codes |= person[1:, :-1] << 2
+    codes |= person[1:, 1:] << 3
+    if unknown.any():
+        flags = bits & _UNKNOWN_BIT
+        codes |= flags[:-1, :-1] | flags[:-1, 1:] | flags[1:, :-1] | flags[1:, 1:]
+    return codes
+
+
+def _classes(codes: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h/4 w/4"]:
+    """(h w) codes -> (h/4 w/4) sets of the answers that occur in each block of 4 x 4 codes."""
+    height, width = codes.shape
+    rows = np.ascontiguousarray(codes).reshape(height // BLOCK_PX, BLOCK_PX, width)
+    any_bits = rows[:, 0] | rows[:, 1] | rows[:, 2] | rows[:, 3]
+    all_bits = rows[:, 0] & rows[:, 1] & rows[:, 2] & rows[:, 3]
+    # Four neighbouring bytes are one 32-bit word: two shifts fold them, whatever the byte order.
+    any_word, all_word = any_bits.view(np.uint32), all_bits.view(np.uint32)
+    any_word = any_word | (any_word >> 16)
+    all_word = all_word & (all_word >> 16)
+    any_block = (any_word | (any_word >> 8)).astype(np.uint8)
+    all_block = (all_word & (all_word >> 8)).astype(np.uint8)
+    classes = np.full(any_block.shape, UNDECIDED, dtype=np.uint8)
+    classes[any_block < _UNKNOWN_BIT] = INSIDE | OUTSIDE
+    classes[any_block == 0] = OUTSIDE
+    classes[(all_block == 15) & (any_block == 15)] = INSIDE
+    classes[all_block >= _UNKNOWN_BIT] = NO_EVIDENCE
+    return classes
+
+
+def _squares(classes: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "levels h w"]:
+    """(h w) classes -> (levels h w): OR over the square of 2**level blocks that starts at a block, cut at the edge."""
+    n_levels = min(MAX_LEVEL, int(np.ceil(np.log2(max(classes.shape))))) + 1
+    squares = np.empty((n_levels, *classes.shape), dtype=np.uint8)
+    squares[0] = classes
+    for level in range(1, n_levels):
+        step = 1 << (level - 1)
+        wide = squares[level - 1].copy()
+        wide[:, :-step] |= squares[level - 1][:, step:]
+        squares[level] = wide
+        squares[level][:-step] |= wide[step:]
+    return squares
+
+
+def _level_of_side() -> np.ndarray:
+    """Level whose squares, two by two, cover a rectangle of so many blocks a side; index 0 is not used."""
+    sides = np.arange((2 << MAX_LEVEL) + 2)
+    return np.maximum(np.ceil(np.log2(np.maximum(sides, 1))).astype(np.int64) - 1, 0)
+
+
+_LEVEL_OF_SIDE = _level_of_side()
+_ANSWER_OF_CODE = np.full(32, NO_EVIDENCE, dtype=np.uint8)
+_ANSWER_OF_CODE[:16] = UNDECIDED
+_ANSWER_OF_CODE[0] = OUTSIDE
+_ANSWER_OF_CODE[15] = INSIDE
