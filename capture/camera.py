@@ -68,7 +68,7 @@ class Camera:
             raise ValueError(f"camera {self.name}: picture size {self.size} px is not positive")
         if self.distortion.shape not in {(n,) for n in _N_DISTORTION}:
             raise ValueError(
-                f"camera {self.name}: {self.distortion.size} distortion values; OpenCV's order has 0, 4, 5 or 8"
+                f"camera {self.name}: {self.distortion.size} distortion values; OpenCV has 0, 4, 5 or 8"
             )
         if self.projection is not None and not self.is_pinhole:
             raise ValueError(

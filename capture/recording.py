@@ -1,0 +1,196 @@
+"""A recording: calibrated cameras, frame numbers, silhouettes and pictures on demand. The door of the
+capture room."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from capture.calibration_file import Calibration, read_calibration
+from capture.errors import RecordingError
+from capture.frame_choice import choose_frames
+from capture.image_sequence import ImageSequence, choose_sequence, find_images, find_inverted
+from capture.rig import Rig
+from capture.silhouettes import FrameSource, Silhouettes
+from capture.world import World, settle_world
+
+__all__ = ["Recording", "RecordingError", "Silhouettes", "open_recording"]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording that has been opened; frames are read when asked for.
+
+    name : the sequence's name ("" if it has none).
+    rig : pinholes, metres: what the pictures and silhouettes handed out were seen by.
+    calibration : the same cameras as delivered, lens distortion included, metres.
+    frame_ids : the frames chosen; a frame is here if at least one camera has it.
+    up : (3,) unit vector, world.
+    unit, metres_per_unit : the calibration's own world unit.
+    notes : what was found out or repaired on opening, a sentence each.
+    source : where frames come from.
+    """
+
+    name: str
+    rig: Rig
+    calibration: Rig
+    frame_ids: tuple[int, ...]
+    up: Float[np.ndarray, " 3"]
+    unit: str
+    metres_per_unit: float
+    notes: tuple[str, ...]
+    source: FrameSource
+
+    def silhouettes(self, frame_id: int) -> Silhouettes:
+        """The frame's silhouettes, undistorted, one a camera of `rig`; what could not be had is None and
+        told."""
+        self._check(frame_id)
+        return self.source.silhouettes(frame_id)
+
+    def picture(self, camera_idx: int, frame_id: int) -> UInt8[np.ndarray, "h w 3"] | None:
+        """The frame's picture (h w 3) RGB, undistorted, as camera `rig[camera_idx]` sees it; None where
+        there is none."""
+        self._check(frame_id)
+        image = self.source.picture(camera_idx, frame_id)
+        return None if image is None else self.calibration[camera_idx].undistort_image(image)
+
+    def fingerprint(self) -> str:
+        """A hash (hex) that changes when an input of this recording changes.
+
+        Over the calibration, unit and up axis, the names and sizes of all files of the chosen frames, and
+        the content of the first and the last of them in each folder: a replaced file of equal size in
+        between goes unnoticed.
+        """
+        digest = hashlib.sha256()
+        digest.update(json.dumps(self.calibration.to_json()).encode())
+        digest.update(f"{self.name}|{self.unit}|{self.up.tolist()}|{self.frame_ids}".encode())
+        by_folder: dict[Path, list[Path]] = {}
+        for path in self.source.files(self.frame_ids):
+            by_folder.setdefault(path.parent, []).append(path)
+        for folder, files in by_folder.items():
+            digest.update(folder.name.encode())
+            for path in files:
+                digest.update(f"{path.name}:{path.stat().st_size}".encode())
+            for path in {files[0]: None, files[-1]: None}:
+                with path.open("rb") as file:
+                    digest.update(hashlib.file_digest(file, "sha256").digest())
+        return digest.hexdigest()
+
+    def _check(self, frame_id: int) -> None:
+        if frame_id not in self.frame_ids:
+            raise KeyError(f"frame {frame_id} is not among the chosen frames")
+
+
+def open_recording(
+    path: Path | str,
+    *,
+    sequence: str | None = None,
+    calibration: Path | str | None = None,
+    frames: str | None = None,
+    units: str = "auto",
+    up: str = "auto",
+    background: Path | str | None = None,
+) -> Recording:
+    """Open a folder in the INRIA layout, or a folder of synchronised videos with calibration and background
+    plates.
+
+    sequence : which sequence, where the folder has several.
+    calibration : a folder of camNN.txt, a Qualisys .qca.txt or a rig .json, instead of the recording's own.
+    frames : "START:STOP:STEP" over frame numbers.
+    units, up : "auto", or the calibration's unit (m, cm, mm) and the world's up axis (x, y, z, -x, -y, -z).
+    background : folder of background plates (videos only).
+
+    Raises RecordingError for whatever cannot be opened; single bad files are marked in `Silhouettes` instead.
+    """
+    root = Path(path)
+    if not root.is_dir():
+        raise RecordingError(f"{root}: no such folder")
+    chosen_calibration = None if calibration is None else Path(calibration)
+    if (root / "videos").is_dir():
+        raise RecordingError(f"{root}: videos are not read yet")
+    return _open_images(root, sequence, chosen_calibration, frames, units, up)
+
+
+def _open_images(
+    root: Path, sequence: str | None, calibration_path: Path | None, frames: str | None, units: str, up: str
+) -> Recording:
+    if (root / "SilhouettesPictures").is_dir() and not (root / "setup").is_dir() and sequence is None:
+        parent = root.resolve().parent
+        if calibration_path is None and (parent / "setup").is_dir():
+            # The sequence's own folder was given: its calibration lies one level up.
+            root, sequence = parent, root.resolve().name
+    name, folder = choose_sequence(root, sequence)
+    images = find_images(name, folder)
+    calibration_path = calibration_path or root / "setup"
+    calibration = read_calibration(calibration_path, images.sizes)
+    inverted = find_inverted(images)
+    probe = ImageSequence(images, calibration.rig, inverted)
+    chosen = choose_frames(probe.frame_ids, frames)
+    first = max(
+        (probe.silhouettes(frame) for frame in sorted({chosen[0], chosen[len(chosen) // 2]})),
+        key=lambda found: sum(image is not None for image in found.images),
+    )
+    world = settle_world(
+        calibration.rig,
+        first.images,
+        declared_unit=calibration.unit,
+        units=units,
+        up=up,
+        where=str(calibration_path),
+    )
+    notes = list(calibration.notes)
+    if inverted:
+        notes.append(f"Silhouettes are black on white, swapped on reading: {', '.join(sorted(inverted))}.")
+    notes += _gap_notes(probe, chosen)
+    delivered = calibration.rig.with_world_scaled(world.metres_per_unit)
+    return _recording(name, calibration, world, chosen, notes, ImageSequence(images, delivered, inverted))
+
+
+def _recording(
+    name: str,
+    calibration: Calibration,
+    world: World,
+    frame_ids: tuple[int, ...],
+    notes: list[str],
+    source: FrameSource,
+) -> Recording:
+    delivered = calibration.rig.with_world_scaled(world.metres_per_unit)
+    return Recording(
+        name=name,
+        rig=delivered.pinholes(),
+        calibration=delivered,
+        frame_ids=frame_ids,
+        up=world.up,
+        unit=world.unit,
+        metres_per_unit=world.metres_per_unit,
+        notes=(*notes, *world.notes),
+        source=source,
+    )
+
+
+def _gap_notes(source: ImageSequence, chosen: tuple[int, ...]) -> list[str]:
+    """Sentences on frames that some cameras lack, and on numbers that no camera has."""
+    notes = []
+    for camera in source.calibration:
+        files = source.folders.silhouettes[camera.name]
+        missing = [frame for frame in chosen if frame not in files]
+        if missing:
+            notes.append(
+                f"Camera {camera.name} lacks {len(missing)} of the {len(chosen)} frames: {_listed(missing)}."
+            )
+    available = source.frame_ids
+    absent = sorted(set(range(available[0], available[-1] + 1)) - set(available))
+    usual_step = min(np.diff(available), default=1)
+    if absent and usual_step == 1:
+        notes.append(f"No camera has frame {_listed(absent)}.")
+    return notes
+
+
+def _listed(numbers: list[int]) -> str:
+    shown = ", ".join(map(str, numbers[:8]))
+    return shown + (f" and {len(numbers) - 8} more" if len(numbers) > 8 else "")

@@ -1,0 +1,163 @@
+"""Silhouettes from image files: any bit depth or channel count to 255 person, 0 background, 128 unknown.
+
+What cannot be trusted becomes no evidence and a sentence, never an exception: one bad file must not stop a
+recording.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Shaped, UInt8
+
+from capture.camera import Camera
+
+PERSON, BACKGROUND, UNKNOWN = 255, 0, 128
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
+@dataclass(frozen=True)
+class SilhouetteFile:
+    """One file, read. `mask` (h w) is None where the file gives no evidence; `problem` then says why.
+
+    A mask that was usable but odd comes with a problem too. `looks_inverted`: the frame's border and most of
+    the picture are person, as in files where black means person.
+    """
+
+    mask: UInt8[np.ndarray, "h w"] | None
+    problem: str | None = None
+    looks_inverted: bool = False
+
+
+def read_silhouette(path: Path, *, inverted: bool = False) -> SilhouetteFile:
+    """Read one silhouette; `inverted` swaps person and background. Problems are phrases without camera and
+    frame."""
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        return SilhouetteFile(None, "file missing")
+    except OSError as error:
+        return SilhouetteFile(None, f"file cannot be read ({error.strerror})")
+    damage = (
+        png_damage(content) if content.startswith(_PNG_SIGNATURE) or path.suffix.lower() == ".png" else None
+    )
+    if damage is not None:
+        return SilhouetteFile(None, damage)
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content else None
+    if image is None:
+        return SilhouetteFile(None, "not an image that OpenCV can decode")
+    mask, problem = mask_from_image(image)
+    if mask is None:
+        return SilhouetteFile(None, problem)
+    if inverted:
+        mask = np.where(mask == UNKNOWN, mask, PERSON - mask).astype(np.uint8)
+    person = mask == PERSON
+    share = person.mean()
+    if share == 0:
+        return SilhouetteFile(None, "silhouette is empty (no pixel is person)")
+    if share > 0.98:
+        return SilhouetteFile(None, f"silhouette covers the whole picture ({100 * share:.1f} % person)")
+    return SilhouetteFile(mask, problem, looks_inverted=_border_share(person) > 0.5 and share > 0.5)
+
+
+def png_damage(content: bytes) -> str | None:
+    """What is broken in a PNG's chain of chunks, or None. OpenCV hands out the upper part of a cut file
+    silently."""
+    if not content.startswith(_PNG_SIGNATURE):
+        return "not a PNG (wrong signature)" if content else "file is empty (0 bytes)"
+    position = len(_PNG_SIGNATURE)
+    while position + 12 <= len(content):
+        length = struct.unpack_from(">I", content, position)[0]
+        kind = content[position + 4 : position + 8]
+        end = position + 12 + length
+        if end > len(content):
+            break
+        if zlib.crc32(content[position + 4 : end - 4]) != struct.unpack_from(">I", content, end - 4)[0]:
+            return f"PNG is damaged (checksum of its {kind.decode('ascii', 'replace')} chunk is wrong)"
+        if kind == b"IEND":
+            return None
+        position = end
+    return f"PNG is truncated (ends after {len(content)} bytes without its closing chunk)"
+
+
+def png_size(path: Path) -> tuple[int, int] | None:
+    """(width, height) px from a PNG's head without decoding it, or of another image by decoding; None:
+    unreadable."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(26)
+    except OSError:
+        return None
+    if head.startswith(_PNG_SIGNATURE) and len(head) >= 24 and head[12:16] == b"IHDR":
+        width, height = struct.unpack_from(">II", head, 16)
+        return (width, height) if width and height else None
+    if path.suffix.lower() == ".png":
+        return None
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    return None if image is None else (image.shape[1], image.shape[0])
+
+
+def mask_from_image(
+    image: Shaped[np.ndarray, "h w *channels"],
+) -> tuple[UInt8[np.ndarray, "h w"] | None, str | None]:
+    """Decoded image -> (mask of 0, 128, 255; problem). The mask is None for what is a photograph, no mask."""
+    grey = _single_channel(image)
+    if grey.dtype == np.bool_:
+        grey = grey.astype(np.uint8) * 255
+    if np.issubdtype(grey.dtype, np.integer) and grey.dtype != np.uint8:
+        top = int(grey.max(initial=0))
+        # 16-bit files hold either the full range or small label numbers.
+        grey = (grey // 257 if top > 255 else grey).astype(np.uint8)
+    elif np.issubdtype(grey.dtype, np.floating):
+        grey = np.clip(np.nan_to_num(grey) * (255 if grey.max(initial=0) <= 1 else 1), 0, 255).astype(
+            np.uint8
+        )
+    counts = np.bincount(grey.ravel(), minlength=256)
+    values = np.flatnonzero(counts)
+    if len(values) == 2 and values[0] == BACKGROUND and values[1] != UNKNOWN:
+        # Nothing and one label: person, whichever number the label has.
+        return np.where(grey > 0, PERSON, BACKGROUND).astype(np.uint8), None
+    unknown = grey == UNKNOWN if counts[UNKNOWN] else None
+    between = (counts[24:232].sum() - counts[UNKNOWN]) / grey.size
+    if between > 0.25:
+        return None, f"not a silhouette: {100 * between:.0f} % of the pixels are neither dark nor bright"
+    mask = np.where(grey > 127, PERSON, BACKGROUND).astype(np.uint8)
+    if unknown is not None and len(values) <= 3:
+        mask[unknown] = UNKNOWN
+    if between > 0.01:
+        return mask, f"not binary ({100 * between:.1f} % of the pixels in between), cut at half"
+    return mask, None
+
+
+def undistort_silhouette(camera: Camera, mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    """The mask as `camera.pinhole()` sees it: bilinear, cut at half; what the camera never saw is unknown.
+
+    Person and unknown are warped apart, so that an edge between person and unknown does not turn into
+    background.
+    """
+    if camera.is_pinhole:
+        return mask
+    person = camera.undistort_image(np.where(mask == PERSON, 255, 0).astype(np.uint8))
+    known = camera.undistort_image(np.where(mask == UNKNOWN, 0, 255).astype(np.uint8))
+    result = np.where(person > 127, PERSON, BACKGROUND).astype(np.uint8)
+    result[(known <= 127) & (person <= 127)] = UNKNOWN
+    return result
+
+
+def _single_channel(image: Shaped[np.ndarray, "h w *channels"]) -> Shaped[np.ndarray, "h w"]:
+    if image.ndim == 2:
+        return image
+    channels = image.reshape(*image.shape[:2], -1)
+    if channels.shape[2] in (2, 4) and channels[..., -1].min() != channels[..., -1].max():
+        return channels[..., -1]  # a transparent background: the alpha channel is the mask
+    return channels[..., :3].max(axis=2)
+
+
+def _border_share(person: Bool[np.ndarray, "h w"]) -> float:
+    border = np.concatenate([person[0], person[-1], person[:, 0], person[:, -1]])
+    return float(border.mean())
