@@ -1,0 +1,71 @@
+"""The one typed configuration: the command line is made from it, and it is written to `run.json`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+Units = Literal["auto", "m", "cm", "mm"]
+Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """What to run on and how."""
+
+    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
+    """Folder of the recording: setup/camNN.txt with SilhouettesPictures/ (INRIA layout), or videos/ with a calibration file
+    and background plates."""
+    out: Annotated[Path, tyro.conf.arg(metavar="RUN")]
+    """Folder of the run; made if missing. Finished work in it is kept."""
+    sequence: str | None = None
+    """Which sequence, where the recording holds several."""
+    body: str = "free:neutral"
+    """Body model: free:neutral, free:female, free:male, or the path of an .npz file in SMPL's format."""
+    calibration: Path | None = None
+    """Calibration to use instead of the recording's own: a .qca.txt file, a rig.json, or a folder of camNN.txt."""
+    frames: Annotated[str | None, tyro.conf.arg(metavar="START:STOP:STEP")] = None
+    """Which frame numbers; all by default."""
+    voxel_mm: float = 8.0
+    """Grid spacing of the carving. The surface is found much finer than this."""
+    units: Units = "auto"
+    """Unit of the calibration's world."""
+    up: Up = "auto"
+    """World axis that points up."""
+    background: Path | None = None
+    """Folder of background plates, <camera>.png, for recordings of videos."""
+    keypoints: Path | None = None
+    """Folder of OpenPose BODY_25 files, <camera>/<frame>.json, to start the pose from. Never needed."""
+    overwrite: bool = False
+    """Redo what this run folder already holds."""
+
+    def carve_settings(self) -> dict[str, object]:
+        """What the hulls depend on, besides the files' contents."""
+        values = self.as_dict()
+        return {k: values[k] for k in ("sequence", "frames", "voxel_mm", "units", "up")}
+
+    def fit_settings(self) -> dict[str, object]:
+        """What the fit depends on, besides the hulls."""
+        values = self.as_dict()
+        return {k: values[k] for k in ("body", "keypoints")}
+
+    def as_dict(self) -> dict[str, object]:
+        """JSON-ready values; paths made absolute so that the run folder can be used from anywhere."""
+        return {k: str(v.absolute()) if isinstance(v, Path) else v for k, v in asdict(self).items()}
+
+    @staticmethod
+    def from_dict(values: dict[str, object]) -> RunConfig:
+        """Inverse of as_dict."""
+        paths = {"recording", "out", "calibration", "background", "keypoints"}
+        known = {k: Path(str(v)) if k in paths and v is not None else v for k, v in values.items()}
+        return RunConfig(**known)  # type: ignore[arg-type]
+
+
+def digest(value: object) -> str:
+    """Short hash of JSON-ready settings."""
+    return sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:12]

@@ -1,0 +1,135 @@
+"""Closest points of a scan on a moving body mesh, with the side on which each point lies.
+
+The paper's `dist(s, M)` (section 4.1): the closest primitive, triangle, edge or vertex. The search runs in
+open3d's ray-casting scene (Embree, float32); the closest point on the found triangle is then computed again in
+float64, so that residuals and their derivatives agree to full precision.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+#: Below this distance the direction (s - c) / d is noise; the interpolated surface normal is used instead.
+CONTACT_M = 1e-4
+
+
+@dataclass(frozen=True)
+class ClosestPoints:
+    """Where each of N points meets a mesh.
+
+    triangle_idx: the face; barycentric: weights of its three corners; points: the closest points, m;
+    normals: unit surface normals there (interpolated vertex normals); distance: m, negative for a point
+    inside the mesh; direction: unit vectors along which the distance is measured, pointing outwards.
+    """
+
+    triangle_idx: Int[np.ndarray, "n"]
+    barycentric: Float[np.ndarray, "n 3"]
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    distance: Float[np.ndarray, "n"]
+    direction: Float[np.ndarray, "n 3"]
+
+
+def vertex_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v 3"]:
+    """Unit vertex normals, faces weighted by area."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    face_normals = np.cross(b - a, c - a)
+    normals = np.stack(
+        [
+            np.bincount(faces.ravel(), np.repeat(face_normals[:, axis], 3), minlength=len(vertices))
+            for axis in range(3)
+        ],
+        axis=1,
+    )
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals / np.maximum(length, 1e-30)
+
+
+def vertex_areas(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v"]:
+    """Area that belongs to each vertex (a third of its faces), m2."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6.0
+    return np.bincount(faces.ravel(), np.repeat(area, 3), minlength=len(vertices))
+
+
+def nearest_triangles(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], points: Float[np.ndarray, "n 3"]
+) -> Int[np.ndarray, "n"]:
+    """Index of the face nearest to each point."""
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        o3d.core.Tensor(np.ascontiguousarray(vertices, dtype=np.float32)),
+        o3d.core.Tensor(np.ascontiguousarray(faces, dtype=np.uint32)),
+    )
+    found = scene.compute_closest_points(o3d.core.Tensor(np.ascontiguousarray(points, dtype=np.float32)))
+    return found["primitive_ids"].numpy().astype(np.int64)
+
+
+def barycentric_of_closest(
+    corners: Float[np.ndarray, "n 3 3"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Barycentric coordinates of the closest point of each triangle to its point.
+
+    corners: (point, corner, axis). The point is projected on the plane; where that falls outside the triangle, the
+    nearest of the three edges decides (clamped to its ends), which covers edges and vertices alike.
+    """
+    a = corners[:, 0]
+    ab, ac, ap = corners[:, 1] - a, corners[:, 2] - a, points - a
+    d00, d01, d11 = (ab * ab).sum(1), (ab * ac).sum(1), (ac * ac).sum(1)
+    d20, d21 = (ap * ab).sum(1), (ap * ac).sum(1)
+    det = np.maximum(d00 * d11 - d01 * d01, 1e-30)
+    v = (d11 * d20 - d01 * d21) / det
+    w = (d00 * d21 - d01 * d20) / det
+    bary = np.stack([1.0 - v - w, v, w], axis=1)
+    outside = np.flatnonzero((bary < 0).any(axis=1))
+    if len(outside) == 0:
+        return bary
+    best = np.full(len(outside), np.inf)
+    chosen = np.zeros((len(outside), 3))
+    p = points[outside]
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        start, edge = corners[outside, i], corners[outside, j] - corners[outside, i]
+        s = ((p - start) * edge).sum(1) / np.maximum((edge * edge).sum(1), 1e-30)
+        s = np.clip(s, 0.0, 1.0)
+        squared = ((start + s[:, None] * edge - p) ** 2).sum(1)
+        nearer = squared < best
+        best = np.where(nearer, squared, best)
+        candidate = np.zeros((len(outside), 3))
+        candidate[:, i], candidate[:, j] = 1.0 - s, s
+        chosen[nearer] = candidate[nearer]
+    bary[outside] = chosen
+    return bary
+
+
+def closest_points(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    points: Float[np.ndarray, "n 3"],
+) -> ClosestPoints:
+    """Closest point of a closed, outward oriented mesh for every scan point.
+
+    The paper's indicator delta (inside or outside) comes from the angle between the surface normal and the vector
+    from the mesh to the scan point; interpolated vertex normals make it reliable at edges and vertices.
+    """
+    triangle_idx = nearest_triangles(vertices, faces, points)
+    triangles = faces[triangle_idx]
+    corners = vertices[triangles]
+    bary = barycentric_of_closest(corners, points)
+    foot = np.einsum("nc,nca->na", bary, corners)
+    normals = np.einsum("nc,nca->na", bary, vertex_normals(vertices, faces)[triangles])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    gap = points - foot
+    distance = np.linalg.norm(gap, axis=1)
+    sign = np.where((gap * normals).sum(1) < 0, -1.0, 1.0)
+    contact = distance < CONTACT_M
+    direction = np.where(
+        contact[:, None], normals, sign[:, None] * gap / np.maximum(distance, 1e-30)[:, None]
+    )
+    # In contact the signed distance is the component along the normal.
+    signed = np.where(contact, (gap * normals).sum(1), sign * distance)
+    return ClosestPoints(triangle_idx, bary, foot, normals, signed, direction)

@@ -1,0 +1,285 @@
+"""A low-resolution body for finding the pose: some hundred vertices, linear skinning, analytic derivatives in numpy.
+
+Pose corrections are left out and normals turn with the blended bones: enough to come within centimetres of a hull, fast
+enough to try dozens of starting poses a frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from fit.body.model import BodyModel
+from fit.closest import vertex_areas, vertex_normals
+
+#: Metres that a full turn of the normal counts in the nearest-neighbour search.
+NORMAL_WEIGHT_M = 0.08
+#: The score's cut-off: a point farther than this says nothing about how far.
+SCORE_CUT_M = 0.10
+
+
+@dataclass(frozen=True)
+class CoarsePose:
+    """pose (J 3) rad, translation (3) m, betas (B; only the first few are used), score m (lower is better)."""
+
+    pose: Float[np.ndarray, "j 3"]
+    translation: Float[np.ndarray, "3"]
+    betas: Float[np.ndarray, "b"]
+    score: float = np.inf
+
+
+@dataclass(frozen=True)
+class CoarseScan:
+    """Points, outward normals, and the search tree over (point, weighted normal)."""
+
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    tree: cKDTree
+
+    @staticmethod
+    def of(points: np.ndarray, normals: np.ndarray, n_points: int = 800) -> CoarseScan:
+        """An even subset of a scan: farthest-point order is dear, a strided subset of an area-uniform scan will do."""
+        keep = np.linspace(0, len(points) - 1, min(n_points, len(points))).astype(int)
+        points, normals = points[keep], normals[keep]
+        return CoarseScan(points, normals, cKDTree(np.hstack([points, NORMAL_WEIGHT_M * normals])))
+
+
+@dataclass(frozen=True)
+class Targets:
+    """3D keypoints to reach: points (L 3) m in the body's frame, weight (L), 0 where nothing was seen."""
+
+    points: Float[np.ndarray, "l 3"]
+    weight: Float[np.ndarray, "l"]
+
+
+@dataclass(frozen=True)
+class CoarseBody:
+    """Vertices (first n_surface) and landmarks of a body model, with what skinning needs.
+
+    rest, shape: positions and their dependence on the betas; joint_rest, joint_shape: the same of the joints;
+    weights (n J); descends (J J): descends[j, k] = 1 where bone k hangs on joint j.
+    """
+
+    n_surface: int
+    parents: Int[np.ndarray, "j"]
+    rest: Float[np.ndarray, "n 3"]
+    shape: Float[np.ndarray, "n 3 b"]
+    rest_normals: Float[np.ndarray, "n 3"]
+    weights: Float[np.ndarray, "n j"]
+    joint_rest: Float[np.ndarray, "j 3"]
+    joint_shape: Float[np.ndarray, "j 3 b"]
+    descends: Float[np.ndarray, "j j"]
+
+    @staticmethod
+    def of(model: BodyModel, n_surface: int = 700, n_betas: int = 4) -> CoarseBody:
+        """Choose vertices evenly over the area of the model (farthest point sampling, deterministic)."""
+        template = model.template
+        chosen = farthest_points(template, n_surface, vertex_areas(template, model.faces))
+        regressor = np.vstack([np.eye(len(template))[chosen], model.landmarks])
+        shape = model.shape_directions[:, :, :n_betas]
+        normals = vertex_normals(template, model.faces)[chosen]
+        parents = np.asarray(model.parents)
+        descends = np.eye(len(parents))
+        for j in range(len(parents) - 1, 0, -1):
+            descends[parents[j]] += descends[j]
+        return CoarseBody(
+            n_surface=len(chosen),
+            parents=parents,
+            rest=regressor @ template,
+            shape=np.einsum("nv,vab->nab", regressor, shape),
+            rest_normals=np.vstack([normals, np.zeros((len(model.landmarks), 3))]),
+            weights=regressor @ model.weights,
+            joint_rest=model.joint_regressor @ template,
+            joint_shape=np.einsum("jv,vab->jab", model.joint_regressor, shape),
+            descends=np.minimum(descends, 1.0),
+        )
+
+    @property
+    def n_betas(self) -> int:
+        """Number of shape coefficients in use."""
+        return self.shape.shape[2]
+
+    def forward(self, at: CoarsePose) -> _Posed:
+        """Positions, normals and the quantities that the derivatives need."""
+        betas = at.betas[: self.n_betas]
+        rest = self.rest + self.shape @ betas
+        joints = self.joint_rest + self.joint_shape @ betas
+        local = Rotation.from_rotvec(at.pose).as_matrix()
+        n_joints = len(self.parents)
+        world = np.empty((n_joints, 3, 3))
+        origin = np.empty((n_joints, 3))
+        for j, parent in enumerate(self.parents):
+            if parent < 0:
+                world[j], origin[j] = local[j], joints[j] + at.translation
+            else:
+                world[j] = world[parent] @ local[j]
+                origin[j] = origin[parent] + world[parent] @ (joints[j] - joints[parent])
+        offset = origin - np.einsum("jab,jb->ja", world, joints)
+        # Where every bone alone would put every vertex, weighted: (n J 3).
+        by_bone = self.weights[:, :, None] * (np.einsum("jab,nb->nja", world, rest) + offset)
+        blended = np.einsum("nj,jab->nab", self.weights, world)
+        normals = np.einsum("nab,nb->na", blended, self.rest_normals)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        return _Posed(by_bone.sum(1), normals, by_bone, blended, world, origin)
+
+    def jacobian(self, posed: _Posed) -> Float[np.ndarray, "n 3 p"]:
+        """dv / d(rotation vectors in the parents' frames (3 J), translation (3), betas)."""
+        n, n_joints = len(self.rest), len(self.parents)
+        moment = np.einsum("jk,nka->nja", self.descends, posed.by_bone)
+        share = self.weights @ self.descends.T
+        arm = moment - share[:, :, None] * posed.origin
+        parent_frame = np.stack([np.eye(3) if p < 0 else posed.world[p] for p in self.parents])
+        out = np.empty((n, 3, 3 * n_joints + 3 + self.n_betas))
+        axes = parent_frame.transpose(0, 2, 1)  # (J, which axis, xyz)
+        out[:, :, : 3 * n_joints] = np.cross(axes[None], arm[:, :, None, :]).transpose(0, 3, 1, 2).reshape(n, 3, -1)
+        out[:, :, 3 * n_joints : 3 * n_joints + 3] = np.eye(3)
+        # Betas move the vertex in its bones' frames, and the joints under it.
+        shape = np.einsum("nab,nbk->nak", posed.blended, self.shape)
+        joint_shift = np.empty((n_joints, 3, self.n_betas))
+        for j, parent in enumerate(self.parents):
+            if parent < 0:
+                joint_shift[j] = self.joint_shape[j]
+            else:
+                relative = self.joint_shape[j] - self.joint_shape[parent]
+                joint_shift[j] = joint_shift[parent] + posed.world[parent] @ relative
+        bone_shift = joint_shift - np.einsum("jab,jbk->jak", posed.world, self.joint_shape)
+        out[:, :, 3 * n_joints + 3 :] = shape + np.einsum("nj,jak->nak", self.weights, bone_shift)
+        return out
+
+
+@dataclass(frozen=True)
+class _Posed:
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    by_bone: Float[np.ndarray, "n j 3"]
+    blended: Float[np.ndarray, "n 3 3"]
+    world: Float[np.ndarray, "j 3 3"]
+    origin: Float[np.ndarray, "j 3"]
+
+
+def farthest_points(
+    points: Float[np.ndarray, "n 3"], count: int, weight: Float[np.ndarray, "n"]
+) -> Int[np.ndarray, "m"]:
+    """Greedy farthest-point sampling, the largest-area vertex first."""
+    chosen = [int(np.argmax(weight))]
+    nearest = ((points - points[chosen[0]]) ** 2).sum(1)
+    for _ in range(min(count, len(points)) - 1):
+        k = int(np.argmax(nearest))
+        chosen.append(k)
+        nearest = np.minimum(nearest, ((points - points[k]) ** 2).sum(1))
+    return np.array(chosen)
+
+
+def left_jacobian_inverse(rotation_vector: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3 3"]:
+    """How the rotation vector changes under a small rotation applied from the left."""
+    angle = np.linalg.norm(rotation_vector, axis=1)
+    half = 0.5 * np.maximum(angle, 1e-6)
+    coefficient = (1.0 - half / np.tan(half)) / np.maximum(angle, 1e-6) ** 2
+    cross = np.zeros((len(angle), 3, 3))
+    x, y, z = rotation_vector.T
+    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -z, y, -x
+    cross -= cross.transpose(0, 2, 1)
+    return np.eye(3) - 0.5 * cross + coefficient[:, None, None] * (cross @ cross)
+
+
+@dataclass(frozen=True)
+class CoarsePrior:
+    """Gaussian over all joints but the root: mean (3 (J-1)), precision; weights of pose and betas."""
+
+    mean: Float[np.ndarray, "m"]
+    precision: Float[np.ndarray, "m m"]
+    pose_weight: float = 0.02
+    betas_weight: float = 0.2
+
+
+def score(body: CoarseBody, scan: CoarseScan, at: CoarsePose) -> float:
+    """Mean symmetric distance in (point, normal) space, cut off, in metres."""
+    posed = body.forward(at)
+    own = np.hstack([posed.points[: body.n_surface], NORMAL_WEIGHT_M * posed.normals[: body.n_surface]])
+    to_scan = scan.tree.query(own)[0]
+    to_body = cKDTree(own).query(np.hstack([scan.points, NORMAL_WEIGHT_M * scan.normals]))[0]
+    return float(0.5 * (np.minimum(to_scan, SCORE_CUT_M).mean() + np.minimum(to_body, SCORE_CUT_M).mean()))
+
+
+def refine(
+    body: CoarseBody,
+    scan: CoarseScan | None,
+    prior: CoarsePrior,
+    start: CoarsePose,
+    sigmas_m: tuple[float, ...],
+    iterations: int = 6,
+    targets: Targets | None = None,
+) -> CoarsePose:
+    """Gauss-Newton on symmetric nearest neighbours (and keypoints), sigma from coarse to fine.
+
+    Residuals are mostly along the scan's normals; Geman-McClure weights with the current sigma; pairs whose normals oppose
+    are left out. Returns the pose with its score against the scan (infinite without one).
+    """
+    at = start
+    n, n_joints = body.n_surface, len(body.parents)
+    size = 3 * n_joints + 3 + body.n_betas
+    for sigma in sigmas_m:
+        for _ in range(iterations):
+            posed = body.forward(at)
+            jacobian = body.jacobian(posed)
+            hessian, rhs = np.zeros((size, size)), np.zeros(size)
+            if scan is not None:
+                own = np.hstack([posed.points[:n], NORMAL_WEIGHT_M * posed.normals[:n]])
+                scan_idx = scan.tree.query(own)[1]
+                body_idx = cKDTree(own).query(np.hstack([scan.points, NORMAL_WEIGHT_M * scan.normals]))[1]
+                vertex = np.concatenate([np.arange(n), body_idx])
+                point = np.concatenate([scan_idx, np.arange(len(scan.points))])
+                gap = scan.points[point] - posed.points[vertex]
+                normal = scan.normals[point]
+                agree = (posed.normals[vertex] * normal).sum(1) > 0.0
+                weight = agree * (sigma**2 / (sigma**2 + (gap**2).sum(1))) ** 2
+                weight = weight / len(weight) * 700.0
+                # 0.7 along the normal, 0.3 in all directions.
+                metric = weight[:, None, None] * (
+                    0.7 * normal[:, :, None] * normal[:, None, :] + 0.3 * np.eye(3)
+                )
+                per_vertex = np.zeros((n, 3, 3))
+                np.add.at(per_vertex, vertex, metric)
+                force = np.zeros((n, 3))
+                np.add.at(force, vertex, np.einsum("mab,mb->ma", metric, gap))
+                surface = jacobian[:n]
+                weighted = np.matmul(per_vertex, surface)
+                hessian += surface.reshape(-1, size).T @ weighted.reshape(-1, size)
+                rhs += surface.reshape(-1, size).T @ force.ravel()
+            if targets is not None:
+                gap = np.where(targets.weight[:, None] > 0, targets.points - posed.points[n:], 0.0)
+                reach = max(sigma, 0.1)
+                weight = 20.0 * targets.weight * (reach**2 / (reach**2 + (gap**2).sum(1))) ** 2
+                flat = jacobian[n:].reshape(-1, size)
+                hessian += flat.T @ (np.repeat(weight, 3)[:, None] * flat)
+                rhs += flat.T @ (np.repeat(weight, 3) * gap.ravel())
+            inner = slice(3, 3 * n_joints)
+            turn = np.zeros((3 * n_joints - 3, 3 * n_joints - 3))
+            for j, block in enumerate(left_jacobian_inverse(at.pose[1:])):
+                turn[3 * j : 3 * j + 3, 3 * j : 3 * j + 3] = block
+            hessian[inner, inner] += prior.pose_weight * turn.T @ prior.precision @ turn
+            rhs[inner] -= prior.pose_weight * turn.T @ (prior.precision @ (at.pose[1:].ravel() - prior.mean))
+            betas = slice(3 * n_joints + 3, size)
+            hessian[betas, betas] += prior.betas_weight * np.eye(body.n_betas)
+            rhs[betas] -= prior.betas_weight * at.betas[: body.n_betas]
+            hessian[np.diag_indices(size)] += 0.05
+            step = cho_solve(cho_factor(hessian), rhs)
+            turns = step[: 3 * n_joints].reshape(-1, 3)
+            largest = np.linalg.norm(turns, axis=1).max()
+            shorten = min(1.0, 0.6 / max(largest, 1e-12))
+            pose = (Rotation.from_rotvec(shorten * turns) * Rotation.from_rotvec(at.pose)).as_rotvec()
+            new_betas = at.betas.copy()
+            new_betas[: body.n_betas] += shorten * step[betas]
+            translation = at.translation + shorten * step[3 * n_joints : 3 * n_joints + 3]
+            moved = np.abs(shorten * step).max()
+            at = CoarsePose(pose, translation, new_betas)
+            if moved < 2e-3:
+                break
+    if scan is None:
+        return at
+    return CoarsePose(at.pose, at.translation, at.betas, score(body, scan, at))

@@ -1,0 +1,86 @@
+"""The fusion shape (paper section 4.2): one naked template inside all unposed clothed templates.
+
+The union of the unposed alignments is the fusion scan; since every frame carves away from the outside, the same objective
+in the zero pose, all points cloth, gives the person's shape.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from fit.align import Alignment
+from fit.closest import vertex_normals
+from fit.settings import FitSettings
+from fit.solver import Fitter, Objective, ScanPoints, Unknowns, minimise
+from fit.state import BodyState
+
+#: Unposed vertices this many robust deviations inside the others are lost points, not a tighter fit.
+CLIP_MAD = 3.5
+CLIP_FLOOR_M = 0.004
+
+
+@dataclass(frozen=True)
+class FusionShape:
+    """T_Fu: template (V 3) m in the zero pose, betas of the model coupled to it, joints (J 3) m.
+
+    spread (V): deviation of the unposed alignments along the normal, m (the paper's figure 2 colours by it).
+    """
+
+    template: Float[np.ndarray, "v 3"]
+    betas: Float[np.ndarray, "b"]
+    joints: Float[np.ndarray, "j 3"]
+    spread: Float[np.ndarray, "v"]
+
+
+def lost_points(
+    offsets: Float[np.ndarray, "t v"], clip_mad: float = CLIP_MAD, floor_m: float = CLIP_FLOOR_M
+) -> Bool[np.ndarray, "t v"]:
+    """Which unposed vertices lie implausibly far inside their fellows of the other frames.
+
+    offsets: along the common normal, positive outwards, m. Only inward outliers are dropped: they alone pull the
+    shape in, and the outside term has little resistance against them.
+    """
+    median = np.median(offsets, axis=0)
+    spread = 1.4826 * np.median(np.abs(offsets - median), axis=0)
+    return offsets < median - np.maximum(clip_mad * spread, floor_m)
+
+
+def fuse(fitter: Fitter, alignments: Sequence[Alignment], settings: FitSettings) -> FusionShape:
+    """Estimate the fusion shape from all alignments that did not fail.
+
+    Raises ValueError when there is none.
+    """
+    good = [a for a in alignments if a.status == "ok"] or [a for a in alignments if a.status != "failed"]
+    if not good:
+        raise ValueError("no frame could be aligned, so there is nothing to fuse")
+    templates = np.stack([a.state.template for a in good])
+    betas = np.median([a.state.betas for a in good], axis=0)
+    mean = templates.mean(0)
+    normals = vertex_normals(mean, fitter.model.faces)
+    offsets = np.einsum("tva,va->tv", templates - mean, normals)
+    keep = ~lost_points(offsets) if len(good) >= 4 else np.ones(offsets.shape, dtype=bool)
+    points = templates.reshape(-1, 3)
+    scan = ScanPoints(
+        points,
+        np.concatenate([vertex_normals(t, fitter.model.faces) for t in templates]),
+        keep.ravel().astype(float),
+        np.zeros(len(points), dtype=bool),
+    )
+    n_joints = len(fitter.model.parents)
+    state = BodyState(fitter.shaped(betas), np.zeros((n_joints, 3)), np.zeros(3), betas)
+    pose_size = 3 * (n_joints - 1)
+    for weights in settings.fuse:
+        objective = Objective(
+            fitter,
+            scan,
+            weights,
+            Unknowns(pose=False, translation=False),
+            np.zeros(pose_size),
+            np.zeros((pose_size, pose_size)),
+        )
+        state = minimise(objective, state, settings.max_iterations, settings.relative_drop).state
+    return FusionShape(state.template, state.betas, fitter.joints(state.betas), offsets.std(axis=0))

@@ -1,0 +1,59 @@
+"""Every weight of the three stages, in one place and with its reason.
+
+Names are the paper's lambdas; `energy.py` tells the normalisation. The paper's numbers (100, 100, 3, 1 with plain sums) do
+not carry over: here outside has weight 1 a point and the sums are means times the number of vertices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class StageWeights:
+    """One objective: which terms, how strong.
+
+    cloth: treat every point as cloth (outside + fit) instead of as skin; sigma_m: Geman-McClure scale of skin or fit;
+    fit: lambda_fit / lambda_outside; outside_m: Huber scale of the outside term; coupling: lambda_cpl; tether: absolute
+    pull of the template to its target; pose_prior, shape_prior: of the Gaussian priors; gate: whether points facing away
+    from the body's surface are ignored.
+    """
+
+    cloth: bool
+    sigma_m: float
+    fit: float = 0.0
+    outside_m: float = 0.006
+    coupling: float = 0.0
+    tether: float = 0.0
+    pose_prior: float = 1e-3
+    shape_prior: float = 1e-3
+    gate: bool = True
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """The stages in order (paper sections 4.1 to 4.3) and the sizes of the problem."""
+
+    n_points: int = 20_000
+    seed: int = 0
+    #: Cloth alignments: pose and shape alone, coarse then fine; then the template, stiff then soft.
+    align_pose: tuple[StageWeights, ...] = (
+        StageWeights(cloth=False, sigma_m=0.15),
+        StageWeights(cloth=False, sigma_m=0.05),
+    )
+    align_joint: tuple[StageWeights, ...] = (
+        StageWeights(cloth=False, sigma_m=0.05, coupling=10.0, tether=1e-2),
+        StageWeights(cloth=False, sigma_m=0.05, coupling=1.0, tether=1e-2),
+    )
+    #: Fusion shape: every vertex of every unposed alignment is a cloth point.
+    fuse: tuple[StageWeights, ...] = (
+        StageWeights(cloth=True, sigma_m=0.02, fit=0.03, coupling=5.0, tether=1e-3, gate=False),
+        StageWeights(cloth=True, sigma_m=0.02, fit=0.03, coupling=0.1, tether=1e-3, gate=False),
+    )
+    #: Tracking: the pose follows the scan a little more willingly than the shape does.
+    track_pose: StageWeights = field(default_factory=lambda: StageWeights(cloth=True, sigma_m=0.05, fit=0.1))
+    track_joint: StageWeights = field(
+        default_factory=lambda: StageWeights(cloth=True, sigma_m=0.02, fit=0.015, coupling=1.0, tether=1e-3)
+    )
+    max_iterations: int = 15
+    relative_drop: float = 5e-3
