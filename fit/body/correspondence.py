@@ -1,0 +1,79 @@
+"""Dense correspondence: the template's vertices carried onto any other person of the family.
+
+Every vertex keeps its coordinates in the lofts, fingers and toes near it; another body decodes them with its own
+tables, and a few Newton steps bring the result onto that body's skin.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import coo_matrix, csr_matrix
+
+from .implicit import ImplicitBody
+from .remesh import SEAM_TOLERANCE_M
+
+OFF_SEAM_M = 6e-4
+SOFTNESS_M = 0.015  # how fast the say of a farther primitive fades
+FARTHEST_M = 0.06
+
+
+def neighbour_mean(faces: Int[np.ndarray, "f 3"], n_vertices: int) -> csr_matrix:
+    """The matrix that averages a quantity over every vertex's neighbours."""
+    e = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    both = np.concatenate([e, e[:, ::-1]])
+    adjacency = coo_matrix((np.ones(len(both)), both.T), (n_vertices, n_vertices)).tocsr()
+    adjacency.data[:] = 1
+    return csr_matrix(adjacency.multiply(1 / np.asarray(adjacency.sum(1))))
+
+
+class Carrier:
+    """Moves the half template onto other bodies; `half` and `faces` belong to the body `source`."""
+
+    def __init__(
+        self, half: Float[np.ndarray, "h 3"], faces: Int[np.ndarray, "g 3"], source: ImplicitBody
+    ) -> None:
+        self.seam = half[:, 0] < SEAM_TOLERANCE_M
+        self.n = len(half)
+        self.ids = [i for i, p in enumerate(source.primitives) if p.carries]
+        carriers = [p for p in source.primitives if p.carries and not hasattr(p, "centre")]
+        distance = np.stack([p.distance(half) for p in carriers])
+        excess = distance - distance.min(0)
+        weight = np.exp(-np.clip(excess / SOFTNESS_M, 0, 30)) * (excess < FARTHEST_M)
+        weight /= weight.sum(0)
+        self.index = [np.flatnonzero(w > 1e-4) for w in weight]
+        self.weight = [w[ix, None] for w, ix in zip(weight, self.index, strict=True)]
+        self.code = [p.encode(half[ix]) for p, ix in zip(carriers, self.index, strict=True)]  # type: ignore[union-attr]
+        # Which vertices each primitive shapes is the same in every body: decided once, on the template.
+        self.reached = [np.flatnonzero(p.distance(half) < 0.03 + p.blend_m) for p in source.primitives]
+        self.smooth = neighbour_mean(faces, self.n)
+
+    def _keep_sides(self, p: Float[np.ndarray, "h 3"]) -> None:
+        p[:, 0] = np.where(self.seam, 0, np.maximum(p[:, 0], OFF_SEAM_M))
+
+    def __call__(self, body: ImplicitBody) -> Float[np.ndarray, "h 3"]:
+        """Half vertices on this body's skin, floor frame, metres."""
+        decoded = np.zeros((self.n, 3))
+        for i, index, code, weight in zip(self.ids, self.index, self.code, self.weight, strict=True):
+            decoded[index] += body.primitives[i].decode(code) * weight  # type: ignore[union-attr]
+        self._keep_sides(decoded)
+
+        on_skin = decoded.copy()
+        value = body(on_skin, self.reached)
+        gradient = np.empty_like(on_skin)
+        for axis in range(3):
+            step = np.zeros(3)
+            step[axis] = 5e-4
+            gradient[:, axis] = (body(on_skin + step, self.reached) - value) / 5e-4
+        gradient[self.seam, 0] = 0
+        gradient /= np.maximum((gradient * gradient).sum(1), 0.1)[:, None]
+        for _ in range(3):  # chord Newton: one gradient serves all three steps
+            move = -value[:, None] * gradient
+            length = np.sqrt((move * move).sum(1))[:, None]
+            on_skin += move * np.minimum(1, 0.02 / np.maximum(length, 1e-9))
+            self._keep_sides(on_skin)
+            value = body(on_skin, self.reached)
+
+        correction = on_skin - decoded
+        for _ in range(2):
+            correction = 0.5 * correction + 0.5 * (self.smooth @ correction)
+        correction[self.seam, 0] = 0
+        return decoded + correction

@@ -1,0 +1,179 @@
+"""The template: a half mesh of the average body, exactly 6890 vertices once mirrored.
+
+Marching cubes on a grid graded in x, y and z, then remeshing to a size field that is fine at hands, feet and face.
+"""
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from skimage.measure import marching_cubes
+
+from .anatomy import make_person
+from .anthropometry import measure
+from .implicit import ImplicitBody
+from .remesh import SEAM_TOLERANCE_M, Remesher
+from .skeleton import JOINT
+
+N_VERTICES = 6890
+
+
+def smooth_step(low: float, high: float, t: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """0 below `low`, 1 above `high` (or the reverse when low > high), with flat ends."""
+    x = np.clip((t - low) / (high - low), 0, 1)
+    return x * x * (3 - 2 * x)
+
+
+def graded_axis(runs: Iterable[tuple[float, float, float]]) -> Float[np.ndarray, "n"]:
+    """Grid planes from (start, end, spacing) runs that follow one another."""
+    runs = list(runs)
+    planes = [np.array([runs[0][0]])]
+    for start, end, spacing in runs:
+        planes.append(np.linspace(start, end, max(round((end - start) / spacing), 1) + 1)[1:])
+    return np.concatenate(planes)
+
+
+def march(
+    body: ImplicitBody, axes: tuple[np.ndarray, ...]
+) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """Zero level set on a rectilinear grid; open at x = 0."""
+    value = np.full([len(a) for a in axes], body.FAR_M)
+    for primitive, is_cut in zip(body.primitives, body.is_cut, strict=True):
+        margin = body.REACH_M + primitive.blend_m
+        box = tuple(
+            slice(*np.searchsorted(a, (primitive.low[i] - margin, primitive.high[i] + margin)))
+            for i, a in enumerate(axes)
+        )
+        corners = np.stack(np.meshgrid(*[a[s] for a, s in zip(axes, box, strict=True)], indexing="ij"), -1)
+        if corners.size:
+            distance = primitive.distance(corners.reshape(-1, 3)).reshape(corners.shape[:3])
+            value[box] = body.join(value[box], distance, primitive, is_cut)
+    vertices, faces, _, _ = marching_cubes(value, 0.0)
+    vertices = np.stack([np.interp(vertices[:, i], np.arange(len(a)), a) for i, a in enumerate(axes)], 1)
+    return vertices, faces.astype(np.int64)
+
+
+def weld(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], tolerance_m: float = 1e-7
+) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
+    """Merge coincident vertices, drop degenerate faces, keep the largest component."""
+    key = np.round(vertices / tolerance_m).astype(np.int64)
+    _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    v, f = vertices[first], inverse.ravel()[faces]
+    f = f[(f[:, 0] != f[:, 1]) & (f[:, 1] != f[:, 2]) & (f[:, 2] != f[:, 0])]
+    e = np.concatenate([f[:, :2], f[:, 1:]])
+    graph = coo_matrix((np.ones(len(e)), (e[:, 0], e[:, 1])), (len(v),) * 2)
+    _, label = connected_components(graph, directed=False)
+    keep = label == np.bincount(label[f[:, 0]]).argmax()
+    new = np.cumsum(keep) - 1
+    return v[keep], new[f[keep[f[:, 0]]]]
+
+
+def wanted_edge(
+    stature: float, wrist_x: float
+) -> Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]:
+    """Edge length in metres by place: 23.5 mm on the body, 8-10 mm at hands, feet and face."""
+    trunk, hand, foot, skull, face = 0.0235, 0.0078, 0.0105, 0.0165, 0.0088
+
+    def wanted(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        x, y, z = points.T
+        edge = trunk + (hand - trunk) * smooth_step(wrist_x - 0.09, wrist_x + 0.05, x)
+        edge = np.minimum(edge, trunk + (foot - trunk) * smooth_step(0.16, 0.03, y))
+        in_face = smooth_step(0.02, 0.07, z) * smooth_step(stature - 0.07, stature - 0.12, y)
+        head = skull + (face - skull) * in_face
+        in_head = smooth_step(stature - 0.33, stature - 0.25, y) * (x < 0.25)
+        return np.minimum(edge, trunk + (head - trunk) * in_head)
+
+    return wanted
+
+
+def settle_count(mesh: Remesher, target: int) -> None:
+    """Single collapses and splits until the mirrored count is met: a seam edge moves it by 1, another by 2."""
+    for _ in range(400):
+        n = mesh.n_mirrored()
+        if n == target:
+            return
+        if n > target:
+            for a, b in sorted(mesh.edges(), key=lambda e: (mesh.relative_length(e), e)):
+                if (n - target == 1) == (mesh.seam[a] and mesh.seam[b]) and mesh.collapse(a, b):
+                    break
+        else:
+            for a, b in sorted(mesh.edges(), key=lambda e: (-mesh.relative_length(e), e)):
+                if (target - n == 1) == (len(mesh.around[a] & mesh.around[b]) == 1):
+                    mesh.split(a, b)
+                    break
+    raise AssertionError(f"remeshing stopped at {mesh.n_mirrored()} vertices instead of {target}")
+
+
+def make_half_mesh(
+    progress: Callable[[], object] = lambda: None,
+) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """Half mesh of the average body (sex 0.5, civilian BMI), floor frame; `progress` is called N_ROUNDS times."""
+    person = measure(0.5)
+    body, joints = make_person(person)
+    stature, shoulder_y, wrist_x = (
+        person.stature,
+        joints[JOINT["left_shoulder"], 1],
+        joints[JOINT["left_wrist"], 0],
+    )
+    axes = (
+        graded_axis([(0, 0.16, 0.008), (0.16, wrist_x - 0.02, 0.011), (wrist_x - 0.02, wrist_x + 0.24, 0.0032)]),
+        graded_axis(
+            [
+                (-0.012, 0.03, 0.004),
+                (0.03, 0.10, 0.006),
+                (0.10, shoulder_y - 0.05, 0.011),
+                (shoulder_y - 0.05, shoulder_y + 0.03, 0.0035),
+                (shoulder_y + 0.03, stature - 0.24, 0.008),
+                (stature - 0.24, stature + 0.02, 0.0055),
+            ]
+        ),
+        graded_axis([(-0.22, -0.06, 0.009), (-0.06, 0.12, 0.0042), (0.12, 0.30, 0.006)]),
+    )
+    v, f = march(body, axes)
+    v[v[:, 0] < 1e-7, 0] = 0
+    v, f = weld(np.round(v, 6), f)
+    progress()
+
+    wanted = wanted_edge(stature, wrist_x)
+    size_factor = 1.03
+    mesh = Remesher(
+        v, f, lambda p: size_factor * wanted(p), lambda p, seam: body.project(p, on_seam=seam, steps=1)
+    )
+    for round_idx in range(N_ROUNDS - 2):
+        if round_idx:
+            mesh.split_pass(1.4)
+        mesh.collapse_pass(0.72 if round_idx else 0.82)
+        mesh.flip_pass()
+        mesh.flip_pass()
+        mesh.relax(2)
+        if round_idx >= 2:
+            size_factor = round(size_factor * (mesh.n_mirrored() / N_VERTICES) ** 0.5, 6)
+        mesh.load(*mesh.arrays())
+        progress()
+    settle_count(mesh, N_VERTICES)
+    for _ in range(4):
+        mesh.flip_pass()
+        mesh.relax(3)
+    v, f = mesh.arrays()
+    progress()
+    return body.project(v, on_seam=v[:, 0] < SEAM_TOLERANCE_M, steps=3), f
+
+
+N_ROUNDS = 10
+
+
+def mirror(
+    v: Float[np.ndarray, "h 3"], f: Int[np.ndarray, "g 3"]
+) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Int[np.ndarray, "v"]]:
+    """Whole body from the half (its vertices first): vertices, faces, and every vertex's partner."""
+    seam = v[:, 0] < SEAM_TOLERANCE_M
+    n = len(v)
+    partner = np.arange(n)
+    partner[~seam] = n + np.arange((~seam).sum())
+    whole = np.concatenate([v, v[~seam] * [-1, 1, 1]])
+    whole[:n][seam, 0] = 0
+    faces = np.concatenate([f, partner[f][:, ::-1]])
+    return whole, faces, np.concatenate([partner, np.flatnonzero(~seam)])
