@@ -76,7 +76,9 @@ def probe(timeout_s: float = 60.0) -> GlReport:
     room = str(Path(__file__).resolve().parent.parent)
     environment = dict(os.environ)
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, [room, environment.get("PYTHONPATH", "")]))
-    platform = environment.get("PYOPENGL_PLATFORM") or ("egl" if sys.platform.startswith("linux") else "default")
+    platform = environment.get("PYOPENGL_PLATFORM") or (
+        "egl" if sys.platform.startswith("linux") else "default"
+    )
     try:
         child = subprocess.run(
             [sys.executable, "-m", "render.gl"],
@@ -87,7 +89,9 @@ def probe(timeout_s: float = 60.0) -> GlReport:
             check=False,
         )
     except subprocess.TimeoutExpired:
-        return GlReport(platform, "", "", f"OpenGL ({platform}) did not answer within {timeout_s:.0f} s: {FIX}")
+        return GlReport(
+            platform, "", "", f"OpenGL ({platform}) did not answer within {timeout_s:.0f} s: {FIX}"
+        )
     lines = child.stdout.strip().splitlines()
     if child.returncode == 0 and lines:
         found = json.loads(lines[-1])

@@ -180,7 +180,9 @@ class Stage:
         for node in self._lights:
             self._scene.remove_node(node)
         self._lights = [
-            self._scene.add(pyrender.DirectionalLight(color=light.colour, intensity=light.intensity), pose=_aim(light))
+            self._scene.add(
+                pyrender.DirectionalLight(color=light.colour, intensity=light.intensity), pose=_aim(light)
+            )
             for light in (lights_of_camera(camera) if lights is None else lights)
         ]
         rgba, _ = _offscreen().render(self._scene, pyrender.RenderFlags.RGBA)
