@@ -1,7 +1,8 @@
 """Where to carve: a box around the person, found from the cameras and silhouettes alone.
 
 A coarse carve of all space that the cameras could mean, in which (from four silhouettes on) a place is given up only
-when two cameras see background there, so that one bad silhouette cannot cut the box short.
+when two cameras see background there, so that one bad silhouette cannot cut the box short. Far from the person, where
+few pictures overlap, such a carve leaves phantoms; the person is the connected piece that most cameras vouch for.
 """
 
 from __future__ import annotations
@@ -11,18 +12,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import find_objects, label
 
 from capture.camera import Camera
-from hull.carve import Grid, touched_box
+from hull.carve import Grid, possible_witnesses
 from hull.diagnosis import why_empty
 from hull.errors import HullError
 from hull.tables import BLOCK_PX, INSIDE, SilhouetteTable, prepare_tables
 from hull.witnesses import witness_rule
 
-# The box is found to this fraction of the cameras' distance (3 cm at 4 m) ...
-_DEPTH_OF_SEARCH = 8
-# ... and widened by this, so that the surface never touches its sides.
-PADDING_M = 0.02
+# The space searched, a cube as wide as twice the cameras' distance, has so many cells a side (6 cm at 4 m).
+_N_CELLS = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,15 +59,18 @@ def bounds_from_tables(tables: Sequence[SilhouetteTable]) -> Bounds:
     """`find_bounds` for silhouettes that are prepared already."""
     subject = meeting_point(tables)
     rule = witness_rule(tables, subject)
-    distances = np.linalg.norm([table.centre - subject for table in tables], axis=1)
-    # The person is nearer to the meeting point than the farthest camera is: further out a rig sees nothing usable.
-    reach = float(distances.max())
-    n = 1 << _DEPTH_OF_SEARCH
-    grid = Grid(subject - reach, 2 * reach / n, (n, n, n))
-    box = touched_box(tables, rule, grid, votes=2 if len(tables) >= 4 else 1)
-    if box is None:
+    # The person is nearer to the meeting point than the cameras are; a few cameras far off do not matter.
+    reach = float(np.median([np.linalg.norm(table.centre - subject) for table in tables]))
+    grid = Grid(subject - reach, 2 * reach / _N_CELLS, (_N_CELLS, _N_CELLS, _N_CELLS))
+    count = possible_witnesses(tables, rule, grid, votes=2 if len(tables) >= 4 else 1)
+    piece, n_pieces = label(count > 0, structure=np.ones((3, 3, 3), dtype=bool))
+    if not n_pieces:
         raise HullError(why_empty(tables, rule, Bounds(subject - reach, subject + reach)))
-    return Bounds(box[0] - PADDING_M, box[1] + PADDING_M)
+    vouched = np.bincount(piece.ravel(), count.ravel())
+    person = find_objects(piece)[int(np.argmax(vouched[1:]))]
+    first, end = np.array([[s.start, s.stop] for s in person]).T
+    # Whole cells were asked, so the box lies around the hull at any resolution and needs no padding beyond one cell.
+    return Bounds(grid.low + (first - 1) * grid.voxel_m, grid.low + (end + 1) * grid.voxel_m)
 
 
 def meeting_point(tables: Sequence[SilhouetteTable]) -> Float[np.ndarray, " 3"]:

@@ -116,30 +116,30 @@ def carve(tables: Sequence[SilhouetteTable], rule: WitnessRule, grid: Grid, vote
     return Blocks(grid, tuple(cells))
 
 
-def touched_box(
+def possible_witnesses(
     tables: Sequence[SilhouetteTable], rule: WitnessRule, grid: Grid, votes: int
-) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]] | None:
-    """A box (low, high), metres, around everything that `carve` could find at any resolution; None if that is nothing.
+) -> Int[np.ndarray, "x y z"]:
+    """How many cameras may see each of the grid's cells inside; 0 where the cell holds nothing of the hull for sure.
 
-    Conservative: whole cells are asked down to the grid's own voxels, and those that stay in question count.
+    Conservative: cells are asked whole, down to the grid's own, and those that stay in question count. So everything
+    that `carve` could find at any resolution lies in a cell that is not 0.
     """
-    coarsest = int(np.log2(max(grid.shape)))
+    coarsest = int(np.log2(min(grid.shape)))
     front = _first_front(rule, [-(-n >> coarsest) for n in grid.shape])
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    found = np.zeros([-(-n >> coarsest) << coarsest for n in grid.shape], dtype=np.int32)
     order = list(range(len(tables)))
     for level in range(coarsest, -1, -1):
-        width_m = (1 << level) * grid.voxel_m
-        centres = grid.centres(front.cells, 1 << level)
-        front = _ask(tables, rule, front, centres, 0.5 * width_m, votes, order)
-        final = np.ones(front.cells.shape[1], dtype=bool) if level == 0 else ~front.unasked.any(axis=0)
-        if final.any():
-            low = np.minimum(low, grid.low + front.cells[:, final].min(axis=1) * width_m)
-            high = np.maximum(high, grid.low + (front.cells[:, final].max(axis=1) + 1) * width_m)
+        side = 1 << level
+        centres = grid.centres(front.cells, side)
+        front = _ask(tables, rule, front, centres, 0.5 * side * grid.voxel_m, votes, order)
+        final = np.full(front.cells.shape[1], level == 0) | ~front.unasked.any(axis=0)
+        count = np.bitwise_count(front.inside | front.unasked).sum(axis=0, dtype=np.int32)[final]
+        i, j, k = front.cells[:, final]
+        nx, ny, nz = (n // side for n in found.shape)
+        found.reshape(nx, side, ny, side, nz, side)[i, :, j, :, k, :] = count[:, None, None, None]
         front = front.kept(~final).children()
-        # A cell that lies in the box already cannot enlarge it.
-        child_low = grid.low[:, None] + front.cells * (0.5 * width_m)
-        front = front.kept(((child_low < low[:, None]) | (child_low + 0.5 * width_m > high[:, None])).any(axis=0))
-    return (low, high) if (high > low).all() else None
+    nx, ny, nz = grid.shape
+    return found[:nx, :ny, :nz]
 
 
 def _first_front(rule: WitnessRule, n: Sequence[int]) -> _Front:
@@ -192,7 +192,7 @@ def _ask(
         n_rejected[camera] = len(outside)
     order.sort(key=lambda camera: -n_rejected[camera] / max(n_asked[camera], 1))
     front = front.kept(alive)
-    if unseen:
+    if unseen or votes > 1:
         # Space that too few cameras can still vouch for is given up early, or it would be split to the end.
         front = front.kept(rule.enough(front.unasked | front.inside))
     return front
