@@ -5,7 +5,7 @@ lofts, muscles and fat ellipsoids and cones, all joined by a smooth union whose 
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -13,7 +13,7 @@ from jaxtyping import Float
 from .anthropometry import GIRTHS, Measurements, mix, survey_mean
 from .implicit import Cone, Ellipsoid, ImplicitBody, Loft, unit
 from .skeleton import JOINT, LEFT_JOINTS, MIRROR
-from .stations import ARM, FINGERS, FIT, FOOT, HEAD, LEG, NECK, PALM, SMALL_TOES, TORSO
+from .stations import ARM, FINGERS, FIT, FOOT, HEAD, LEG, NECK, PALM, SMALL_TOES, TAPE_CORRECTION, TORSO
 
 FOOT_TURN_DEG = 7.0  # toes point outwards when standing
 SHOULDER_INSET_M = 0.030  # joint centre inwards from the acromion
@@ -316,12 +316,26 @@ def add_foot(body: ImplicitBody, b: Build) -> None:
         )
 
 
+def read_by_tape(m: Measurements) -> Measurements:
+    """The girths to model so that a tape around the finished mesh reads the ones asked for.
+
+    Smooth unions add a little more to thin bodies than to heavy ones; `stations.TAPE_CORRECTION` holds how much.
+    """
+    average = survey_mean(m.sex)
+    modelled = {}
+    for name, (constant, by_sex, by_size) in TAPE_CORRECTION.items():
+        asked = getattr(m, name)
+        excess = constant + by_sex * (m.sex - 0.5) + by_size * np.log(asked / getattr(average, name))
+        modelled[name] = float(asked * np.exp(-excess))
+    return replace(m, **modelled)
+
+
 def make_person(m: Measurements) -> tuple[ImplicitBody, Float[np.ndarray, "24 3"]]:
     """The implicit left half body and the joints of a person with these measurements.
 
     The order of the parts matters: a smooth union bulges where a later part meets an earlier one.
     """
-    build = plan(m)
+    build = plan(read_by_tape(m))
     body = ImplicitBody()
     for add in (
         add_torso,

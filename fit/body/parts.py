@@ -94,7 +94,7 @@ def _foot_points(
     inner, outer = spread.min(), spread.max()
     length = forward.max() - forward.min()
     big = v[(spread - inner) < 0.35 * (outer - inner)]
-    small = v[(outer - spread) < 0.25 * (outer - inner)]
+    small = v[(outer - spread) < 0.15 * (outer - inner)]
     sole = template[foot]
     low = sole[sole[:, 1] < floor + 0.045]
     heel = low[low[:, 2].argmin()]

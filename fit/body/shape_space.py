@@ -22,6 +22,8 @@ N_ANTHROPOMETRIC = 16
 N_DISPLACEMENT = 32
 DISPLACEMENT_SD_M = 0.0045
 """RMS over the body of the smoothest displacement component at one standard deviation."""
+ASYMMETRY = 0.4
+"""Standard deviation of components that differ left from right, against those that do not."""
 HOLD = 1e4  # stiffness of held vertices: a bump dies off within about 1 / sqrt(HOLD) = 1 cm
 
 
@@ -130,7 +132,7 @@ def displacement_components(
     # The mirror commutes with the operator: even and odd modes are solved for apart, so that none is a mixture.
     everyone = np.arange(len(v))
     is_left = everyone <= partner
-    values, vectors = [], []
+    values, vectors, spread = [], [], []
     for sign, base in ((1.0, is_left), (-1.0, everyone < partner)):
         own = np.flatnonzero(base)
         column = np.full(len(v), -1)
@@ -145,13 +147,14 @@ def displacement_components(
         )
         values.append(found)
         vectors.append(extend @ modes)
-    values, vectors = np.concatenate(values), np.concatenate(vectors, 1)
+        spread.append(np.full(n_components, 1.0 if sign > 0 else ASYMMETRY))
+    values, vectors, spread = np.concatenate(values), np.concatenate(vectors, 1), np.concatenate(spread)
     order = np.argsort(values, kind="stable")[:n_components]
-    values, vectors = values[order], vectors[:, order]
+    values, vectors, spread = values[order], vectors[:, order], spread[order]
     rms = np.sqrt((area[:, None] * vectors**2).sum(0) / area.sum())
     # Outwards at the mode's strongest left vertex: a sign that does not hang on the eigensolver.
     strongest = np.abs(vectors * is_left[:, None]).argmax(0)
     sign_of = np.sign(vectors[strongest, np.arange(len(order))])
-    sd = DISPLACEMENT_SD_M / (1 + values / values[len(order) // 2])
+    sd = DISPLACEMENT_SD_M * spread / (1 + values / values[len(order) // 2])
     bumps = vectors * (sign_of * sd / rms)
     return vertex_normals(v, f)[:, :, None] * bumps[:, None, :]
