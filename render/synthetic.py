@@ -28,6 +28,7 @@ from capture.rig import Rig
 from fit.body import BodyModel
 from fit.body.skeleton import JOINT
 
+from .light import bake
 from .motions import joint_positions, make_motion, stance_travel
 from .scene import Renderer, Surface, studio_lights
 from .subject import Subject, make_subject
@@ -157,11 +158,12 @@ def film_performance(
         leave=False,
     ) as bar:
         for frame_idx in range(len(performance.vertices)):
-            stage = renderer.stage(performance.surfaces(frame_idx))
+            surfaces = performance.surfaces(frame_idx)
+            stage = renderer.stage(bake(surfaces, lights) if pictures else surfaces)
             for camera_idx, camera in enumerate(rig):
                 label = f"cam-{camera_idx:03d}"
                 if pictures:
-                    seen = stage.colour(camera, lights)
+                    seen = stage.colour(camera, ())
                     mask = seen.mask
                     picture = blend(seen.colour, seen.coverage, backgrounds[camera_idx])
                     _write_png(place / "Pictures" / label / f"img_{frame_idx:06d}.png", picture[:, :, ::-1])

@@ -37,6 +37,10 @@ HAIR_TONES: tuple[Tones, ...] = (
 SHOE_TONES: tuple[Tones, ...] = (((32, 32, 34), (46, 46, 50)), ((214, 212, 206), (196, 194, 190)))
 
 
+NECK_HALF_WIDTH_M = 0.085
+"""Beyond this from the midline a collar's plane would cut into the shoulders."""
+
+
 def _smallest(*fields: Values) -> Values:
     return np.minimum.reduce(fields)
 
@@ -55,20 +59,26 @@ def shirt(sleeve: float, hem: float, collar_m: float = 0.02) -> Field:
         return _smallest(
             (sleeve - body.along_arm(points)) * body.arm_m,
             (hem - body.along_leg(points)) * leg_m,
-            collar_m - (points - body["neck"]) @ np.array([0.0, 0.85, 0.53]),
+            np.maximum(
+                collar_m - (points - body["neck"]) @ np.array([0.0, 0.85, 0.53]),
+                np.abs(points[:, 0]) - NECK_HALF_WIDTH_M,
+            ),
         )
 
     return inside
 
 
 def sports_top() -> Field:
-    """A sleeveless top from the lower ribs to the collar bones."""
+    """A sleeveless top from the lower ribs up, with straps over the shoulders."""
 
     def inside(points: Points, body: Landmarks) -> Values:
         return _smallest(
-            (-0.02 - body.along_arm(points)) * body.arm_m,
+            (0.02 - body.along_arm(points)) * body.arm_m,
             points[:, 1] - (0.6 * body["spine1"][1] + 0.4 * body["spine2"][1]),
-            -0.015 - (points - body["neck"]) @ np.array([0.0, 0.75, 0.66]),
+            np.maximum(
+                -0.055 - (points - body["neck"]) @ np.array([0.0, 0.75, 0.66]),
+                np.abs(points[:, 0]) - NECK_HALF_WIDTH_M - 0.02,
+            ),
         )
 
     return inside
