@@ -1,8 +1,9 @@
 """Where to carve: a box around the person, found from the cameras and silhouettes alone.
 
-A coarse carve of all space that the cameras could mean, in which (from four silhouettes on) a place is given up only
-when two cameras see background there, so that one bad silhouette cannot cut the box short. Far from the person, where
-few pictures overlap, such a carve leaves phantoms; the person is the connected piece that most cameras vouch for.
+A coarse carve of all space that the cameras could mean, in which (from four silhouettes on) a place is given
+up only when two cameras see background there, so that one bad silhouette cannot cut the box short. Far from
+the person, where few pictures overlap, such a carve leaves phantoms; the person is the connected piece that
+most cameras vouch for.
 """
 
 from __future__ import annotations
@@ -69,7 +70,8 @@ def bounds_from_tables(tables: Sequence[SilhouetteTable]) -> Bounds:
     vouched = np.bincount(piece.ravel(), count.ravel())
     person = find_objects(piece)[int(np.argmax(vouched[1:]))]
     first, end = np.array([[s.start, s.stop] for s in person]).T
-    # Whole cells were asked, so the box lies around the hull at any resolution and needs no padding beyond one cell.
+    # Whole cells were asked, so the box lies around the hull at any resolution and needs no padding beyond
+    # one cell.
     return Bounds(grid.low + (first - 1) * grid.voxel_m, grid.low + (end + 1) * grid.voxel_m)
 
 
@@ -86,7 +88,9 @@ def meeting_point(tables: Sequence[SilhouetteTable]) -> Float[np.ndarray, " 3"]:
     if len(origins) < 2:
         empty = [table.name for table in tables if _central_ray(table) is None]
         which = f" (empty: {', '.join(empty)})" if empty else ""
-        raise HullError(f"{len(origins)} of {len(tables)} silhouettes show anything{which}; a hull needs at least 2")
+        raise HullError(
+            f"{len(origins)} of {len(tables)} silhouettes show anything{which}; a hull needs at least 2"
+        )
     origin, direction = np.array(origins), np.array(directions)
     across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
     weight = np.ones(len(origin))

@@ -1,9 +1,9 @@
 """Adaptive carving: which cells of a grid lie inside every silhouette.
 
-Coarse to fine, as in Szeliski 1993 (reference, section 6b): a cell is asked camera by camera; a cell wholly outside one
-silhouette is gone, a cell wholly inside a silhouette never needs that camera again and passes this on to its children,
-and only cells that some camera cannot decide are split. Memory and time go with the surface, not with the volume. The
-result equals asking every cell's centre in every camera.
+Coarse to fine, as in Szeliski 1993: a cell is asked camera by camera; a cell wholly outside one silhouette is
+gone, a cell wholly inside a silhouette never needs that camera again and passes this on to its children, and
+only cells that some camera cannot decide are split. Memory and time go with the surface, not with the volume.
+The result equals asking every cell's centre in every camera.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from jaxtyping import Bool, Float, Int, UInt64
 from hull.tables import INSIDE, NO_EVIDENCE, OUTSIDE, SilhouetteTable
 from hull.witnesses import WORD_BITS, WitnessRule
 
-# Cells start 2**COARSEST_LEVEL voxels wide: 26 cm at 8 mm, about a limb's length; starting wider saves nothing.
+# Cells start 2**COARSEST_LEVEL voxels wide: 26 cm at 8 mm, about a limb's length; starting wider saves
+# nothing.
 COARSEST_LEVEL = 5
 
 _CHILDREN = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.int32).T
@@ -25,7 +26,7 @@ _CHILDREN = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Cubic voxels. Voxel (i, j, k) has its centre at low + (i + 1/2, j + 1/2, k + 1/2) * voxel_m, world metres."""
+    """Cubic voxels. Voxel (i, j, k) has its centre at low + (i + 1/2, j + 1/2, k + 1/2) * voxel_m, world."""
 
     low: Float[np.ndarray, " 3"]
     voxel_m: float
@@ -55,7 +56,7 @@ class Blocks:
         return first, end
 
     def dense(self, first: Int[np.ndarray, " 3"], end: Int[np.ndarray, " 3"]) -> Bool[np.ndarray, "x y z"]:
-        """The voxels from `first` up to `end` as a bool volume; may reach beyond the grid (where all is outside)."""
+        """The voxels from `first` up to `end` as a bool volume; beyond the grid all is outside."""
         coarsest = 1 << (len(self.cells) - 1)
         # Whole coarsest cubes, so that cubes of every size can be written through a reshaped view.
         low = first // coarsest
@@ -104,9 +105,11 @@ def carve(tables: Sequence[SilhouetteTable], rule: WitnessRule, grid: Grid, vote
         side = 1 << level
         # Only voxel centres are asked for in the end, so a cell reaches from its first to its last centre.
         half_m = 0.5 * (side - 1) * grid.voxel_m
-        within = (front.cells * side < np.array(grid.shape)[:, None]).all(axis=0)
-        front = _ask(tables, rule, front.kept(within), grid.centres(front.cells[:, within], side), half_m, votes, order)
-        decided = ~front.unasked.any(axis=0)
+        within = np.asarray((front.cells * side < np.array(grid.shape)[:, None]).all(axis=0))
+        front = _ask(
+            tables, rule, front.kept(within), grid.centres(front.cells[:, within], side), half_m, votes, order
+        )
+        decided = np.asarray(~front.unasked.any(axis=0))
         sure = np.flatnonzero(decided)
         found.append(front.cells[:, sure[rule.enough(front.inside[:, sure])]])
         if level:
@@ -119,10 +122,10 @@ def carve(tables: Sequence[SilhouetteTable], rule: WitnessRule, grid: Grid, vote
 def possible_witnesses(
     tables: Sequence[SilhouetteTable], rule: WitnessRule, grid: Grid, votes: int
 ) -> Int[np.ndarray, "x y z"]:
-    """How many cameras may see each of the grid's cells inside; 0 where the cell holds nothing of the hull for sure.
+    """How many cameras may see each cell of the grid inside; 0 where it surely holds nothing of the hull.
 
-    Conservative: cells are asked whole, down to the grid's own, and those that stay in question count. So everything
-    that `carve` could find at any resolution lies in a cell that is not 0.
+    Conservative: cells are asked whole, down to the grid's own, and those that stay in question count. So
+    everything that `carve` could find at any resolution lies in a cell that is not 0.
     """
     coarsest = int(np.log2(min(grid.shape)))
     front = _first_front(rule, [-(-n >> coarsest) for n in grid.shape])
@@ -162,7 +165,10 @@ def _ask(
     votes: int,
     order: list[int],
 ) -> _Front:
-    """The front without the cells that are now known to be outside. Sorts `order`: who rejects most is asked first."""
+    """The front without the cells that are now known to be outside.
+
+    Sorts `order`, so that the camera that rejects most is asked first on the next level.
+    """
     alive = np.ones(centres.shape[1], dtype=bool)
     unseen = False
     n_rejected = np.zeros(len(tables))
@@ -173,7 +179,9 @@ def _ask(
         if not len(selected):
             continue
         points = centres[:, selected]
-        answers = tables[camera].ask_points(points) if half_m == 0 else tables[camera].ask_cells(points, half_m)
+        answers = (
+            tables[camera].ask_points(points) if half_m == 0 else tables[camera].ask_cells(points, half_m)
+        )
         outside = selected[answers == OUTSIDE]
         if votes == 1:
             alive[outside] = False
@@ -190,7 +198,8 @@ def _ask(
             front.unasked[word, blind] &= ~bit
         n_asked[camera] = len(selected)
         n_rejected[camera] = len(outside)
-    order.sort(key=lambda camera: -n_rejected[camera] / max(n_asked[camera], 1))
+    rejects = n_rejected / np.maximum(n_asked, 1)
+    order.sort(key=lambda camera: -float(rejects[camera]))
     front = front.kept(alive)
     if unseen or votes > 1:
         # Space that too few cameras can still vouch for is given up early, or it would be split to the end.

@@ -1,8 +1,8 @@
 """What to keep of a raw surface: checked, free of specks and of pieces that no silhouette needs.
 
-A visual hull is the largest shape that fits the silhouettes, so where limbs cross in the pictures it holds phantom
-pieces with nothing in them. A separate piece is kept if it is the largest, or if some picture would lose something
-without it (a hand that the grid cut off, a thrown ball); see "safe hulls", Miller and Hilton.
+A visual hull is the largest shape that fits the silhouettes, so where limbs cross in the pictures it holds
+phantom pieces with nothing in them. A separate piece is kept if it is the largest, or if some picture would
+lose something without it (a hand that the grid cut off, a thrown ball); see "safe hulls", Miller and Hilton.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from hull.rays import RayScene
 from hull.tables import INSIDE, SilhouetteTable
 
 # Below this share of the largest piece's volume a piece is a speck, whatever it covers (5 cm^3 of a person).
@@ -37,7 +38,7 @@ def keep_what_matters(
     candidates = np.flatnonzero((volumes > SPECK_SHARE * volumes[largest]) & ~keep)
     phantoms = []
     if len(candidates):
-        scene = _scene(vertices, faces[label == largest])
+        scene = RayScene(vertices, faces[label == largest], n_threads=1)
         for piece in candidates:
             corners = vertices[np.unique(faces[label == piece])]
             if _is_needed(corners, scene, tables):
@@ -47,7 +48,10 @@ def keep_what_matters(
     vertices, faces = compacted(vertices, faces[keep[label]])
     notes = []
     if phantoms:
-        notes.append(f"left out {len(phantoms)} separate pieces ({sum(phantoms) * 1000:.2f} L) that no silhouette needs")
+        notes.append(
+            f"left out {len(phantoms)} separate pieces ({sum(phantoms) * 1000:.2f} L) "
+            "that no silhouette needs"
+        )
     if keep.sum() > 1:
         parts = ", ".join(f"{volume * 1000:.2f} L" for volume in sorted(volumes[keep], reverse=True))
         notes.append(f"the hull is in {keep.sum()} separate pieces ({parts})")
@@ -57,7 +61,9 @@ def keep_what_matters(
 def face_pieces(faces: Int[np.ndarray, "f 3"], n_vertices: int) -> Int[np.ndarray, " f"]:
     """(F,) number, from 0, of the connected piece each face belongs to."""
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    graph = coo_array((np.ones(len(ends), dtype=bool), (ends[:, 0], ends[:, 1])), shape=(n_vertices, n_vertices))
+    graph = coo_array(
+        (np.ones(len(ends), dtype=bool), (ends[:, 0], ends[:, 1])), shape=(n_vertices, n_vertices)
+    )
     _, of_vertex = connected_components(graph.tocsr(), directed=False)
     return np.unique(of_vertex[faces[:, 0]], return_inverse=True)[1].ravel()
 
@@ -107,26 +113,9 @@ def is_closed(faces: Int[np.ndarray, "f 3"], n_vertices: int) -> bool:
     return bool(len(faces)) and np.array_equal(forth, back) and not (forth[1:] == forth[:-1]).any()
 
 
-def _is_needed(corners: Float[np.ndarray, "n 3"], scene: object, tables: Sequence[SilhouetteTable]) -> bool:
-    import open3d as o3d
-
+def _is_needed(corners: Float[np.ndarray, "n 3"], scene: RayScene, tables: Sequence[SilhouetteTable]) -> bool:
     for table in tables:
         seen = table.ask_points(corners.T) == INSIDE
-        if not seen.any():
-            continue
-        ways = (corners[seen] - table.centre).astype(np.float32)
-        rays = np.concatenate([np.broadcast_to(table.centre.astype(np.float32), ways.shape), ways], axis=1)
-        covered = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].isfinite().numpy()  # type: ignore[attr-defined]
-        if (~covered).mean() > _NEEDED_SHARE:
+        if seen.any() and (~scene.covers(table.centre, corners[seen])).mean() > _NEEDED_SHARE:
             return True
     return False
-
-
-def _scene(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> object:
-    import open3d as o3d
-
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32))
-    )
-    return scene

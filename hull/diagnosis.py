@@ -33,7 +33,10 @@ def why_empty(tables: Sequence[SilhouetteTable], rule: WitnessRule, box: Box) ->
     unclear = [table.name for table in tables if (table.squares[0] == NO_EVIDENCE).all()]
     blank = [name for name in blank if name not in unclear]
     if blank:
-        return f"the silhouettes of {_listed(blank)} show nobody, so nothing is left; leave them out (None) or redo them"
+        return (
+            f"the silhouettes of {_listed(blank)} show nobody, so nothing is left; "
+            "leave them out (None) or redo them"
+        )
     spared = volumes_without_each(tables, rule, box)
     culprit = int(np.argmax(spared))
     if spared[culprit] > 0:
@@ -46,17 +49,23 @@ def why_empty(tables: Sequence[SilhouetteTable], rule: WitnessRule, box: Box) ->
                 "look at its silhouette and its calibration, or leave it out"
             )
         several = [tables[i].name for i in np.argsort(-spared, kind="stable")[:3] if spared[i] > 0]
-        return f"the silhouettes have no space in common; leaving out one of {_listed(several)} would leave some"
+        return (
+            f"the silhouettes have no space in common; leaving out one of {_listed(several)} would leave some"
+        )
     return (
-        f"the silhouettes of the {len(tables)} cameras have no space in common, even without any single one of them; "
-        "do the calibration and the pictures belong together (units, picture size, order of the cameras)?"
+        f"the silhouettes of the {len(tables)} cameras have no space in common, even without any single one "
+        "of them; do the calibration and the pictures belong together "
+        "(units, picture size, order of the cameras)?"
     )
 
 
-def volumes_without_each(tables: Sequence[SilhouetteTable], rule: WitnessRule, box: Box) -> Float[np.ndarray, " c"]:
+def volumes_without_each(
+    tables: Sequence[SilhouetteTable], rule: WitnessRule, box: Box
+) -> Float[np.ndarray, " c"]:
     """(C,) volume, cubic metres, of the hull that is left when each camera is left out; coarse.
 
-    One carve with two votes holds everything that any single camera empties; its voxels are then asked once more.
+    One carve with two votes holds everything that any single camera empties; its voxels are then asked once
+    more.
     """
     extent = np.asarray(box.high) - np.asarray(box.low)
     voxel_m = float(extent.max()) / _N_ACROSS
@@ -76,7 +85,7 @@ def volumes_without_each(tables: Sequence[SilhouetteTable], rule: WitnessRule, b
 def answers_of_all(
     tables: Sequence[SilhouetteTable], points: Float[np.ndarray, "3 n"]
 ) -> UInt8[np.ndarray, "c n"]:
-    """(C N) every camera's answer for every point (3 N): the plain definition that carving has to reproduce."""
+    """(C N) every camera's answer for every point (3 N): the definition that carving reproduces."""
     return np.stack([table.ask_points(points) for table in tables])
 
 

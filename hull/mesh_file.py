@@ -1,7 +1,8 @@
 """Meshes in files: PLY with double precision, and OBJ or OFF for other programs.
 
-A file appears whole or not at all: it is written under a temporary name in the same folder, then renamed. PLY keeps
-every bit of the vertices (and of the normals, if given); OBJ and OFF are text and keep what open3d prints.
+A file appears whole or not at all: it is written under a temporary name in the same folder, then renamed. PLY
+keeps every bit of the vertices (and of the normals, if given); OBJ and OFF are text and keep what open3d
+prints.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int, Integer, UInt8
 
 FORMATS = (".ply", ".obj", ".off")
 
@@ -24,7 +25,7 @@ class MeshFileError(ValueError):
 def save_mesh(
     path: Path | str,
     vertices: Float[np.ndarray, "v 3"],
-    faces: Int[np.ndarray, "f 3"],
+    faces: Integer[np.ndarray, "f 3"],
     normals: Float[np.ndarray, "v 3"] | None = None,
     colours: UInt8[np.ndarray, "v 3"] | None = None,
 ) -> None:
@@ -52,14 +53,16 @@ def save_mesh(
     try:
         with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
             written = o3d.io.write_triangle_mesh(
-                str(part),
+                part,
                 mesh,
                 write_ascii=path.suffix.lower() == ".off",
                 write_vertex_normals=normals is not None,
                 write_vertex_colors=colours is not None,
             )
         if not written:
-            raise MeshFileError(f"cannot write {path}: is the disk full, or the mesh empty ({len(faces)} faces)?")
+            raise MeshFileError(
+                f"cannot write {path}: is the disk full, or the mesh empty ({len(faces)} faces)?"
+            )
         # mkstemp makes files that only the owner may read; results get the permissions of ordinary files.
         part.chmod(0o666 & ~_umask())
         part.replace(path)
@@ -71,7 +74,9 @@ def save_mesh(
 def load_mesh(path: Path | str) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
     """Vertices (V 3, as in the file) and faces (F 3) of a .ply, .obj or .off file. Raises MeshFileError."""
     mesh = _read(Path(path))
-    return np.asarray(mesh.vertices, dtype=np.float64).copy(), np.asarray(mesh.triangles, dtype=np.int64).copy()
+    return np.asarray(mesh.vertices, dtype=np.float64).copy(), np.asarray(
+        mesh.triangles, dtype=np.int64
+    ).copy()
 
 
 def load_normals(path: Path | str) -> Float[np.ndarray, "v 3"] | None:
@@ -95,7 +100,7 @@ def _read(path: Path):  # type: ignore[no-untyped-def]  # open3d ships no types
     if not path.is_file():
         raise MeshFileError(f"there is no mesh file {path}")
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        mesh = o3d.io.read_triangle_mesh(str(path))
+        mesh = o3d.io.read_triangle_mesh(path)
     if not len(mesh.triangles):
         raise MeshFileError(f"{path} holds no triangles that can be read; is it cut short, or a point cloud?")
     if not np.isfinite(np.asarray(mesh.vertices)).all():
@@ -105,7 +110,9 @@ def _read(path: Path):  # type: ignore[no-untyped-def]  # open3d ships no types
 
 def _check_format(path: Path) -> None:
     if path.suffix.lower() not in FORMATS:
-        raise MeshFileError(f"{path}: meshes are {', '.join(FORMATS)} files, not {path.suffix or 'without ending'}")
+        raise MeshFileError(
+            f"{path}: meshes are {', '.join(FORMATS)} files, not {path.suffix or 'without ending'}"
+        )
 
 
 def _umask() -> int:

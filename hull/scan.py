@@ -1,7 +1,8 @@
 """A scan: what the body is fitted to.
 
-The paper fits to 3D scans whose points are labelled skin or cloth (section 4.1); a visual hull is a scan that is all
-cloth. Points are spread evenly over the surface, so that energies summed over points are integrals over area.
+The paper fits to 3D scans whose points are labelled skin or cloth (section 4.1); a visual hull is a scan that
+is all cloth. Points are spread evenly over the surface, so that energies summed over points are integrals
+over area.
 """
 
 from __future__ import annotations
@@ -58,8 +59,8 @@ def even_samples(
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
     """Faces (N,) and barycentric coordinates (N 3) of points that are even in area.
 
-    Stratified along the faces' running area: each n-th of the area gets one point, so that neighbouring faces (which
-    marching cubes numbers one after another) share them out with less clumping than independent draws.
+    Stratified along the faces' running area: each n-th of the area gets one point, so that neighbouring faces
+    (which marching cubes numbers one after another) share them out with less clumping than independent draws.
     """
     assert n_points > 0, "a scan without points"
     random = np.random.default_rng(seed)

@@ -1,7 +1,7 @@
 """From inside cells to a closed surface whose vertices lie on the silhouettes' cones.
 
-Marching cubes gives the topology on the binary grid; then every vertex is moved along its grid edge to where the edge
-leaves the hull, found by bisection in the pictures (marching intersections, Tarini et al. 2002; reference, section 6c).
+Marching cubes gives the topology on the binary grid; then every vertex is moved along its grid edge to where
+the edge leaves the hull, found by bisection in the pictures (marching intersections, Tarini et al. 2002).
 That makes the surface four times as accurate as the grid, without distance transforms.
 """
 
@@ -11,13 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from hull.carve import Blocks, Grid
 from hull.tables import OUTSIDE, SilhouetteTable
 
-# A level below one half makes marching cubes join voxels that touch at an edge, always alike: with exactly one half the
-# tables' ties are broken at random and edges with four faces appear.
+# A level below one half makes marching cubes join voxels that touch at an edge, always alike: with exactly
+# one half the tables' ties are broken at random and edges with four faces appear.
 _LEVEL = 0.4
 # One 128th of a voxel: far below a pixel.
 _N_HALVINGS = 7
@@ -45,8 +45,8 @@ class GridSurface:
 def binary_surface(blocks: Blocks, slab_voxels: int = SLAB_VOXELS) -> GridSurface:
     """The surface between inside and outside voxels: closed, every edge with two faces.
 
-    Large volumes are done in slabs of about `slab_voxels`: an edge has the same whole-number name in both of two
-    neighbouring slabs, so they join exactly.
+    Large volumes are done in slabs of about `slab_voxels`: an edge has the same whole-number name in both of
+    two neighbouring slabs, so they join exactly.
     """
     first, end = blocks.span()
     first, end = first - 1, end + 1
@@ -86,23 +86,36 @@ def _marched(blocks: Blocks, low: Int[np.ndarray, " 3"], high: Int[np.ndarray, "
     far = near + on_edge
     near_is_inner = volume[tuple(near.T)][:, None]
     return GridSurface(
-        np.where(near_is_inner, near, far) + low, np.where(near_is_inner, far, near) + low, faces.astype(np.int64)
+        np.where(near_is_inner, near, far) + low,
+        np.where(near_is_inner, far, near) + low,
+        faces.astype(np.int64),
     )
 
 
 def cross_exactly(
     surface: GridSurface, grid: Grid, tables: Sequence[SilhouetteTable]
 ) -> Float[np.ndarray, "v 3"]:
-    """(V 3) world points, metres, where each grid edge leaves the hull.
-
-    Each camera in turn is asked at the present exit; only where it says "outside" does it shorten the way, by
-    bisection. The exit is thus the first one of all cameras, found with little more than one question per camera.
-    """
+    """(V 3) world points, metres, where each grid edge leaves the hull."""
     origin = grid.centres(surface.inner.T)
     along = (surface.outer - surface.inner).T * grid.voxel_m
-    n_vertices = len(surface.inner)
-    exit_at = np.ones(n_vertices)
-    cut = np.zeros(n_vertices, dtype=bool)
+    exit_at, cut = exits(tables, origin, along)
+    # Where no camera refuses the far end, it was given up for want of witnesses: nobody knows better than
+    # half way.
+    exit_at[~cut] = 0.5
+    return (origin + along * np.clip(exit_at, _KEEP_OFF, 1.0 - _KEEP_OFF)).T
+
+
+def exits(
+    tables: Sequence[SilhouetteTable], origin: Float[np.ndarray, "3 n"], along: Float[np.ndarray, "3 n"]
+) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """(N,) where on the way `along` (3 N, metres) from `origin` (inside) the hull ends; whether it does.
+
+    Each camera in turn is asked at the present exit; only where it says "outside" does it shorten the way, by
+    bisection. The exit is thus the first one of all cameras, found with little more than one question per
+    camera.
+    """
+    exit_at = np.ones(origin.shape[1])
+    cut = np.zeros(origin.shape[1], dtype=bool)
     for table in tables:
         refused = np.flatnonzero(table.ask_points(origin + along * exit_at) == OUTSIDE)
         if not len(refused):
@@ -116,6 +129,4 @@ def cross_exactly(
             outer = np.where(outside, middle, outer)
             inner = np.where(outside, inner, middle)
         exit_at[refused] = 0.5 * (inner + outer)
-    # Where no camera refuses the far end, it was given up for want of witnesses: nobody knows better than half way.
-    exit_at[~cut] = 0.5
-    return (origin + along * np.clip(exit_at, _KEEP_OFF, 1.0 - _KEEP_OFF)).T
+    return exit_at, cut

@@ -1,16 +1,17 @@
 """A silhouette prepared for carving: quick answers about points and about whole cells.
 
-Step: section 4 of Zhang et al. 2017 takes visual hulls as given scans; this is the image side of making them. One
-predicate defines the hull everywhere in this package: the binary silhouette, interpolated bilinearly at the
-projection of a point, is at least one half. It is answered in two ways that agree exactly:
+Step: section 4 of Zhang et al. 2017 takes visual hulls as given scans; this is the image side of making them.
+One predicate defines the hull everywhere in this package: the binary silhouette, interpolated bilinearly at
+the projection of a point, is at least one half. It is answered in two ways that agree exactly:
 
-- for a point, from the *codes*: one byte a pixel that packs the 2 x 2 pixels around it, so that a single look-up
-  decides all but the points within a pixel of the outline;
-- for a cell, from the *classes*: quarter-size blocks of codes, each marked with the set of answers found in it, OR-ed
-  over squares of 1, 2, 4, ... blocks, so that four look-ups give every answer that occurs in a rectangle.
+- for a point, from the *codes*: one byte a pixel that packs the 2 x 2 pixels around it, so that a single
+  look-up decides all but the points within a pixel of the outline;
+- for a cell, from the *classes*: quarter-size blocks of codes, each marked with the set of answers found in
+  it, OR-ed over squares of 1, 2, 4, ... blocks, so that four look-ups give every answer that occurs in a
+  rectangle.
 
-Sparse OR tables were chosen over summed areas because they carry three kinds of answer in one byte a block, and over a
-pyramid because their squares start at any block, which keeps the rectangle tight.
+Sparse OR tables were chosen over summed areas because they carry three kinds of answer in one byte a block,
+and over a pyramid because their squares start at any block, which keeps the rectangle tight.
 """
 
 from __future__ import annotations
@@ -34,9 +35,11 @@ UNDECIDED = INSIDE | OUTSIDE | NO_EVIDENCE
 PERSON, BACKGROUND, UNKNOWN = 255, 0, 128
 
 BLOCK_PX = 4
-# What segmentation says of the outermost pixels cannot be trusted: there is no picture beyond them to compare with.
+# What segmentation says of the outermost pixels cannot be trusted: there is no picture beyond them to compare
+# with.
 BORDER_PX = 2
-# Squares of up to 2**MAX_LEVEL blocks; larger rectangles (over 2 * 128 px wide) are undecided in practice anyway.
+# Squares of up to 2**MAX_LEVEL blocks; larger rectangles (over 2 * 128 px wide) are undecided in practice
+# anyway.
 MAX_LEVEL = 5
 
 _UNKNOWN_BIT = 16
@@ -53,8 +56,10 @@ class SilhouetteTable:
     projection : (3 4), px from world, third value the depth.
     centre : (3,) where the camera stands, world.
     lowest, highest : the first and the last code (column, row) that holds evidence.
-    origin : (column, row) of the first code stored; what lies beyond the stored ones equals the nearest stored one.
-    codes : (h w) bits 0 to 3: person at the pixel, its right, its lower, its lower right neighbour; bit 4: unknown.
+    origin : (column, row) of the first code stored; what lies beyond the stored ones equals the nearest
+        stored one.
+    codes : (h w) bits 0 to 3: person at the pixel, its right, its lower, its lower right neighbour; bit 4:
+        unknown.
     squares : (levels h/4 w/4) sets of answers in the square of 2**level blocks that starts at a block.
     """
 
@@ -94,10 +99,10 @@ class SilhouetteTable:
         return answers
 
     def ask_cells(self, centres: Float[np.ndarray, "3 n"], half_m: float) -> UInt8[np.ndarray, " n"]:
-        """The set of answers that can occur in each cube of half side `half_m` around the centres (3 N), metres.
+        """The answers that can occur in each cube of half side `half_m` around the centres (3 N), metres.
 
-        A superset: a set of one element is certain, a larger one means "split and ask again". The bound on how far a
-        cube reaches in the picture is the exact one for a projective map with a single division (reference 6b).
+        A superset: a set of one element is certain, a larger one means "split and ask again". The bound on
+        how far a cube reaches in the picture is the exact one for a projective map with a single division .
         """
         p = self.projection
         u, v, depth = p[:, :3] @ centres + p[:, 3:]
@@ -151,13 +156,16 @@ class SilhouetteTable:
         too_large = level >= levels
         level = np.minimum(level, levels - 1)
         reach = (1 << level) - 1
-        # A square wider than the rectangle starts further left or up: it then covers more, which is still safe.
+        # A square wider than the rectangle starts further left or up: it then covers more, which is still
+        # safe.
         x_1 = np.maximum(x_1 - reach, 0)
         y_1 = np.maximum(y_1 - reach, 0)
         flat = self.squares.ravel()
         upper = (level * height + y_0) * width
         lower = (level * height + y_1) * width
-        answers = flat.take(upper + x_0) | flat.take(upper + x_1) | flat.take(lower + x_0) | flat.take(lower + x_1)
+        answers = (
+            flat.take(upper + x_0) | flat.take(upper + x_1) | flat.take(lower + x_0) | flat.take(lower + x_1)
+        )
         answers[too_large] = UNDECIDED
         return answers
 
@@ -165,12 +173,15 @@ class SilhouetteTable:
 def prepare_tables(rig: Iterable[Camera], images: Sequence[np.ndarray | None]) -> tuple[SilhouetteTable, ...]:
     """One table for each camera that has a silhouette, in the rig's order.
 
-    `images`: per camera a (h w) uint8 silhouette as the camera's pinhole sees it (255 person, 0 background, 128
-    unknown) or None (no evidence). Raises HullError naming the camera when counts, sizes or types disagree.
+    `images`: per camera a (h w) uint8 silhouette as the camera's pinhole sees it (255 person, 0 background,
+    128 unknown) or None (no evidence). Raises HullError naming the camera when counts, sizes or types
+    disagree.
     """
     cameras = tuple(rig)
     if len(cameras) != len(images):
-        raise HullError(f"{len(cameras)} cameras but {len(images)} silhouettes; give one (or None) per camera, in order")
+        raise HullError(
+            f"{len(cameras)} cameras but {len(images)} silhouettes; give one (or None) per camera, in order"
+        )
     return tuple(
         prepare_table(camera, image, camera_idx)
         for camera_idx, (camera, image) in enumerate(zip(cameras, images, strict=True))
@@ -179,12 +190,13 @@ def prepare_tables(rig: Iterable[Camera], images: Sequence[np.ndarray | None]) -
 
 
 def prepare_table(camera: Camera, image: UInt8[np.ndarray, "h w"], camera_idx: int) -> SilhouetteTable:
-    """The table of one silhouette. Only the silhouette's own surroundings are stored. Raises HullError as above."""
+    """The table of one silhouette. Only its surroundings are stored. Raises HullError as above."""
     width, height = camera.size
     if image.dtype != np.uint8 or image.shape != (height, width):
         raise HullError(
-            f"camera {camera.name}: its silhouette is {image.dtype} of shape {image.shape}, expected uint8 of shape "
-            f"({height}, {width}) as the calibration says; were the pictures scaled, or the cameras mixed up?"
+            f"camera {camera.name}: its silhouette is {image.dtype} of shape {image.shape}, expected "
+            f"uint8 of shape ({height}, {width}) as the calibration says; "
+            "were the pictures scaled, or the cameras mixed up?"
         )
     pixels, origin = _surroundings(image)
     codes = _codes(pixels)
@@ -205,7 +217,8 @@ def prepare_table(camera: Camera, image: UInt8[np.ndarray, "h w"], camera_idx: i
 def _surroundings(image: UInt8[np.ndarray, "h w"]) -> tuple[UInt8[np.ndarray, "h2 w2"], tuple[int, int]]:
     """The part of the picture around what is not background, one clear block wide, and its (column, row).
 
-    Beyond the picture and in its border pixels it is UNKNOWN. One pixel more than whole blocks in both directions.
+    Beyond the picture and in its border pixels it is UNKNOWN. One pixel more than whole blocks in both
+    directions.
     """
     height, width = image.shape
     x, y, w, h = cv2.boundingRect(image)
@@ -261,7 +274,7 @@ def _classes(codes: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h/4 w/4"]:
 
 
 def _squares(classes: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "levels h w"]:
-    """(h w) classes -> (levels h w): OR over the square of 2**level blocks that starts at a block, cut at the edge."""
+    """(h w) classes -> (levels h w): OR over the square of 2**level blocks from a block on."""
     n_levels = min(MAX_LEVEL, int(np.ceil(np.log2(max(classes.shape))))) + 1
     squares = np.empty((n_levels, *classes.shape), dtype=np.uint8)
     squares[0] = classes

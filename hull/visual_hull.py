@@ -1,7 +1,7 @@
 """One frame's visual hull: silhouettes in, a closed surface out.
 
-The paper's scans for the INRIA recordings are such hulls (section 5.1); here they are made from the silhouettes
-themselves: tables, box, adaptive carving, marching cubes, exact crossings, cleaning.
+The paper's scans for the INRIA recordings are such hulls (section 5.1); here they are made from the
+silhouettes themselves: tables, box, adaptive carving, marching cubes, exact crossings, cleaning.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from hull.carve import Grid, carve
 from hull.cleaning import is_closed, keep_what_matters, vertex_normals
 from hull.diagnosis import why_empty
 from hull.errors import HullError
+from hull.ridges import raise_ridges
 from hull.surface import binary_surface, cross_exactly
 from hull.tables import NO_EVIDENCE, SilhouetteTable, prepare_tables
 from hull.witnesses import witness_rule
@@ -63,8 +64,8 @@ def build_hull(
     voxel_m : grid pitch. The surface is about four times as accurate; thinner parts than this may be lost.
     bounds : where to look; found from the silhouettes if None.
 
-    Raises HullError: fewer than two silhouettes, a silhouette of another size than its camera's, or an empty hull,
-    naming the cameras at fault.
+    Raises HullError: fewer than two silhouettes, a silhouette of another size than its camera's, or an empty
+    hull, naming the cameras at fault.
     """
     if not voxel_m > 0:
         raise HullError(f"voxel_m is {voxel_m}; it must be a positive length in metres, such as 0.008")
@@ -78,7 +79,10 @@ def build_hull(
         raise HullError(why_empty(tables, rule, bounds))
     surface = binary_surface(blocks)
     vertices = cross_exactly(surface, grid, tables)
-    vertices, faces, problems = keep_what_matters(vertices, surface.faces, tables)
+    vertices, faces = raise_ridges(
+        vertices, surface.faces, vertex_normals(vertices, surface.faces), tables, voxel_m
+    )
+    vertices, faces, problems = keep_what_matters(vertices, faces, tables)
     assert is_closed(faces, len(vertices)), "the hull's surface is not closed"
     return Hull(
         vertices=vertices,
@@ -90,14 +94,14 @@ def build_hull(
 
 
 def grid_over(bounds: Bounds, voxel_m: float) -> Grid:
-    """The grid that covers the box, on whole multiples of `voxel_m`: frames and runs share their grid points."""
+    """The grid that covers the box, on whole multiples of `voxel_m`: all frames share grid points."""
     first = np.floor(bounds.low / voxel_m)
     end = np.ceil(bounds.high / voxel_m)
     nx, ny, nz = (int(n) for n in end - first)
     if nx * ny * nz > 2**40:
         raise HullError(
-            f"the box of {np.round(bounds.size_m, 1).tolist()} m at {voxel_m * 1000:g} mm has {nx} x {ny} x {nz} voxels; "
-            "are the cameras in metres? Give a larger voxel or smaller bounds"
+            f"the box of {np.round(bounds.size_m, 1).tolist()} m at {voxel_m * 1000:g} mm has "
+            f"{nx} x {ny} x {nz} voxels; are the cameras in metres? Give a larger voxel or smaller bounds"
         )
     return Grid(first * voxel_m, voxel_m, (nx, ny, nz))
 

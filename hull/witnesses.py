@@ -1,7 +1,8 @@
 """Who has seen a place: enough cameras, from directions different enough, or it does not count as inside.
 
-A camera gives no evidence about what lies outside its picture, behind it, or under an unknown pixel. If that alone
-decided, all space that no picture shows would count as inside; so a place needs witnesses (reference, section 6d).
+A camera gives no evidence about what lies outside its picture, behind it, or under an unknown pixel. If that
+alone decided, all space that no picture shows would count as inside; so a place needs witnesses (reference,
+section 6d).
 """
 
 from __future__ import annotations
@@ -68,13 +69,14 @@ def packed(members: Bool[np.ndarray, " c"]) -> UInt64[np.ndarray, " w"]:
 
 
 def witness_rule(tables: Sequence[SilhouetteTable], subject: Float[np.ndarray, " 3"]) -> WitnessRule:
-    """Three witnesses over 90 degrees where the rig has them; half of the widest angle, or two, where it has not.
+    """Three witnesses over 90 degrees where the rig has them, else two over half of its widest angle.
 
     `subject` (3,): about where the person is, metres. Raises HullError with fewer than two silhouettes.
     """
     if len(tables) < 2:
         raise HullError(
-            f"{len(tables)} of the cameras gave a silhouette; a hull needs at least 2, and 3 or more to be of use"
+            f"{len(tables)} of the cameras gave a silhouette; "
+            "a hull needs at least 2, and 3 or more to be of use"
         )
     directions = np.array([table.centre for table in tables]) - subject
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
