@@ -27,6 +27,8 @@ from .scene import vertex_normals
 
 RIM_DEPTH_M = 0.004
 """How far under the skin a closed edge ends (m)."""
+LAYER_M = 0.003
+"""Distance between two garments worn over each other (m)."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,8 @@ class Cut:
     inside: metres inside the garment's edge for points of the zero pose (negative outside; only the sign and the slope
     near zero matter). least_m: nowhere thinner. ease_m: mean extra room where it is loosest. looseness: 0..1 of that
     room at points of the zero pose. bridge: how many smoothing steps of about a centimetre it spans hollows with.
-    fold_m: height of folds. over_m: room for what is worn under it. colours: cloth's two tones.
+    fold_m: height of folds. colours: cloth's two tones. stripes_m: their width, 0: none. lively: 1 cloth that hangs and
+    drifts, 0 a thing that keeps its shape.
     """
 
     name: str
@@ -77,6 +80,7 @@ class Cut:
     fold_m: float
     colours: tuple[tuple[int, int, int], tuple[int, int, int]]
     stripes_m: float = 0.0
+    lively: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -152,11 +156,13 @@ def drape(
     velocity: Float[np.ndarray, "v 3"],
     up: Float[np.ndarray, "3"],
     moment: float,
-) -> Float[np.ndarray, "n 3"]:
-    """Vertices (outer, then the rim's foot) on the posed body (m).
+    under: Float[np.ndarray, " v"],
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " v"]]:
+    """Vertices (outer, then the rim's foot) on the posed body (m), and how high the body is covered now (m a vertex).
 
     velocity: metres a frame of the body's vertices (the cloth trails behind). up: unit, the posed body's frame.
-    moment: what the slow drift and the folds follow, in radians; about one a second of vigorous movement.
+    moment: what the slow drift and the folds follow, in radians; about one a second of vigorous movement. under: how
+    high what is worn already stands over the skin: this garment goes over it.
     """
     cut = garment.cut
     skin = garment.from_body @ posed
@@ -165,19 +171,25 @@ def drape(
 
     # Cloth lies on what faces up (0) and hangs off what faces down (1).
     hanging = 0.5 - 0.5 * (flat_normals @ up)
-    trailing = -np.einsum("na,na->n", garment.from_body @ velocity, normals) / 0.05
-    drifting = np.einsum("nkc,kc->n", garment.waves, _turned(garment.drift, moment)) / np.sqrt(
-        len(garment.drift)
-    )
-    share = (0.45 + 1.1 * hanging**1.5) * np.exp(0.55 * drifting) + 0.35 * np.tanh(trailing)
-    lift = garment.room_m * np.clip(share, 0.0, 2.4)
+    # Where it is held off just now (1) and where it lies on (0): wanders over the garment as the person moves.
+    amplitudes = _turned(garment.drift, moment)
+    drifting = np.einsum("nkc,kc->n", garment.waves, amplitudes) / np.sqrt(len(amplitudes))
+    held_off = 0.5 + 0.5 * np.tanh(1.3 * drifting)
+    trailing = np.tanh(-np.einsum("na,na->n", garment.from_body @ velocity, normals) / 0.05)
+    share = (0.4 + 1.1 * hanging**1.5) * 2.2 * held_off**1.3 + 0.4 * trailing
+    share = 1.0 + cut.lively * (np.maximum(share, 0.0) - 1.0)
+    lift = garment.room_m * share
+    most = 2.0 * cut.ease_m
+    lift = most * np.tanh(lift / most)
 
     speed = 0.6 + 0.4 * np.arange(garment.fold_phase.shape[1]) / garment.fold_phase.shape[1]
     ridges = 1.0 - np.abs(np.sin(0.5 * (garment.fold_phase + moment * speed)))
-    freedom = np.clip(lift / max(cut.ease_m, 1e-6), 0.0, 1.0)
+    freedom = np.clip(lift / cut.ease_m, 0.0, 1.0)
     lift = lift + cut.fold_m * (0.25 + 0.75 * freedom) * (ridges.mean(1) - 0.36) * 2.0
 
     lift = cut.least_m + _softly_positive(lift, 0.002)
+    below = garment.from_body @ under
+    lift = np.maximum(lift, np.where(below > 0, below + LAYER_M, 0.0))
     outer = skin + lift[:, None] * flat_normals
     if cut.bridge:
         bridged = outer.copy()
@@ -185,13 +197,22 @@ def drape(
             bridged = bridged + 0.5 * (garment.mean_of_neighbours @ bridged - bridged)
         # Only outwards: where smoothing would cut into a bulge the cloth lies on the bulge.
         reach = np.einsum("na,na->n", bridged - skin, flat_normals)
-        more = np.clip(reach - lift, 0.0, 0.08)
-        for _ in range(2):
+        more = np.clip(reach - lift, 0.0, 0.05) * (0.5 + 0.5 * held_off)
+        for _ in range(3):
             more = 0.5 * more + 0.5 * (garment.mean_of_neighbours @ more)
         outer = outer + more[:, None] * flat_normals
     outer = _kept_outside(outer, skin, normals, cut.least_m)
     foot = skin[garment.rim] - RIM_DEPTH_M * normals[garment.rim]
-    return np.concatenate([outer, foot])
+    height = np.einsum("na,na->n", outer - skin, flat_normals)
+    return np.concatenate([outer, foot]), np.maximum(under, _highest(garment.from_body, height))
+
+
+def _highest(from_body: sp.csr_array, height: Float[np.ndarray, " n"]) -> Float[np.ndarray, " v"]:
+    """The largest height among the garment's vertices that a body vertex takes part in; 0 where there is none."""
+    out = np.zeros(from_body.shape[1])
+    rows = np.repeat(np.arange(from_body.shape[0]), np.diff(from_body.indptr))
+    np.maximum.at(out, from_body.indices, height[rows])
+    return out
 
 
 # -- cutting ------------------------------------------------------------------------------------------------------

@@ -69,8 +69,9 @@ class Subject:
     ) -> list[Surface]:
         """The posed body and what it wears, ready to be drawn. Arguments as `garments.drape`; any upright frame."""
         surfaces = [Surface(posed, self.body.faces, self.skin_colours, roughness=0.65)]
+        covered = np.zeros(len(posed))
         for garment in self.garments:
-            vertices = drape(garment, posed, self.body.faces, velocity, up, moment)
+            vertices, covered = drape(garment, posed, self.body.faces, velocity, up, moment, covered)
             colours = np.concatenate([garment.colours, garment.colours[garment.rim]])
             surfaces.append(Surface(vertices, garment.faces, colours, roughness=0.9))
         return surfaces

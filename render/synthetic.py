@@ -43,7 +43,7 @@ LAYOUTS: dict[str, Callable[[int, tuple[int, int]], Rig]] = {
 RECORDING_FROM_BODY = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 """World (z up) from the body's upright frame (y up, z front): a quarter turn about x."""
 UP = np.array([0.0, 0.0, 1.0])
-FRAME_RADIANS = 0.35
+FRAME_RADIANS = 0.5
 """What one frame advances the drift of the cloth by (rad)."""
 OWN_FOLDERS = ("setup", "SilhouettesPictures", "Pictures", "truth")
 

@@ -205,7 +205,7 @@ def _loose(rng: np.random.Generator) -> tuple[Cut, ...]:
             0.009,
             _tones(rng, DARK_TONES),
         ),
-        Cut("baggy shirt", shirt(0.9, 0.3), 0.004, 0.036, shirt_room, 45, 0.009, _tones(rng, CLOTH_TONES)),
+        Cut("baggy shirt", shirt(0.9, 0.3), 0.004, 0.034, shirt_room, 45, 0.009, _tones(rng, CLOTH_TONES)),
     )
 
 
@@ -232,10 +232,10 @@ OUTFITS: dict[str, Callable[[np.random.Generator], tuple[Cut, ...]]] = {
 
 def shoes(rng: np.random.Generator) -> Cut:
     """Low shoes with a sole."""
-    return Cut("shoes", shoe(), 0.003, 0.014, shoe_room, 6, 0.0, _tones(rng, SHOE_TONES))
+    return Cut("shoes", shoe(), 0.003, 0.013, shoe_room, 6, 0.0, _tones(rng, SHOE_TONES), lively=0.0)
 
 
 def hair(rng: np.random.Generator) -> Cut:
     """Short to medium hair."""
     room = float(rng.uniform(0.006, 0.02))
-    return Cut("hair", hair_line(), 0.003, room, hair_room, 4, 0.003, _tones(rng, HAIR_TONES))
+    return Cut("hair", hair_line(), 0.003, room, hair_room, 4, 0.003, _tones(rng, HAIR_TONES), lively=0.15)
