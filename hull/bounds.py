@@ -66,7 +66,7 @@ def bounds_from_tables(tables: Sequence[SilhouetteTable]) -> Bounds:
     count = possible_witnesses(tables, rule, grid, votes=2 if len(tables) >= 4 else 1)
     piece, n_pieces = label(count > 0, structure=np.ones((3, 3, 3), dtype=bool))
     if not n_pieces:
-        raise HullError(why_empty(tables, rule, Bounds(subject - reach, subject + reach)))
+        raise HullError(why_empty(tables, rule, subject - reach, subject + reach))
     vouched = np.bincount(piece.ravel(), count.ravel())
     person = find_objects(piece)[int(np.argmax(vouched[1:]))]
     first, end = np.array([[s.start, s.stop] for s in person]).T

@@ -6,7 +6,6 @@ Leaving each camera out in turn: if the others agree on something, that camera i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -18,17 +17,13 @@ from hull.witnesses import WitnessRule
 _N_ACROSS = 128
 
 
-class Box(Protocol):
-    """Anything with a low and a high corner (3,), metres."""
-
-    @property
-    def low(self) -> Float[np.ndarray, " 3"]: ...
-    @property
-    def high(self) -> Float[np.ndarray, " 3"]: ...
-
-
-def why_empty(tables: Sequence[SilhouetteTable], rule: WitnessRule, box: Box) -> str:
-    """The sentence for the user. `box`: where it was looked."""
+def why_empty(
+    tables: Sequence[SilhouetteTable],
+    rule: WitnessRule,
+    low: Float[np.ndarray, " 3"],
+    high: Float[np.ndarray, " 3"],
+) -> str:
+    """The sentence for the user. `low`, `high`: the box that was searched, world metres."""
     blank = [table.name for table in tables if not (table.squares[0] & INSIDE).any()]
     unclear = [table.name for table in tables if (table.squares[0] == NO_EVIDENCE).all()]
     blank = [name for name in blank if name not in unclear]
@@ -37,7 +32,7 @@ def why_empty(tables: Sequence[SilhouetteTable], rule: WitnessRule, box: Box) ->
             f"the silhouettes of {_listed(blank)} show nobody, so nothing is left; "
             "leave them out (None) or redo them"
         )
-    spared = volumes_without_each(tables, rule, box)
+    spared = volumes_without_each(tables, rule, low, high)
     culprit = int(np.argmax(spared))
     if spared[culprit] > 0:
         others = np.delete(spared, culprit)
@@ -60,17 +55,20 @@ def why_empty(tables: Sequence[SilhouetteTable], rule: WitnessRule, box: Box) ->
 
 
 def volumes_without_each(
-    tables: Sequence[SilhouetteTable], rule: WitnessRule, box: Box
+    tables: Sequence[SilhouetteTable],
+    rule: WitnessRule,
+    low: Float[np.ndarray, " 3"],
+    high: Float[np.ndarray, " 3"],
 ) -> Float[np.ndarray, " c"]:
     """(C,) volume, cubic metres, of the hull that is left when each camera is left out; coarse.
 
     One carve with two votes holds everything that any single camera empties; its voxels are then asked once
     more.
     """
-    extent = np.asarray(box.high) - np.asarray(box.low)
+    extent = high - low
     voxel_m = float(extent.max()) / _N_ACROSS
     nx, ny, nz = (max(int(np.ceil(e / voxel_m)), 1) for e in extent)
-    blocks = carve(tables, rule, Grid(np.asarray(box.low), voxel_m, (nx, ny, nz)), votes=2)
+    blocks = carve(tables, rule, Grid(low, voxel_m, (nx, ny, nz)), votes=2)
     if not blocks.n_voxels:
         return np.zeros(len(tables))
     first, end = blocks.span()

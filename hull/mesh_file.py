@@ -17,6 +17,11 @@ from jaxtyping import Float, Int, Integer, UInt8
 
 FORMATS = (".ply", ".obj", ".off")
 
+_PLY_BYTES = dict.fromkeys(("char", "uchar", "int8", "uint8"), 1)
+_PLY_BYTES |= dict.fromkeys(("short", "ushort", "int16", "uint16"), 2)
+_PLY_BYTES |= dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4)
+_PLY_BYTES |= dict.fromkeys(("double", "float64"), 8)
+
 
 class MeshFileError(ValueError):
     """A mesh cannot be read or written: which file, and why."""
@@ -99,6 +104,8 @@ def _read(path: Path):  # type: ignore[no-untyped-def]  # open3d ships no types
     _check_format(path)
     if not path.is_file():
         raise MeshFileError(f"there is no mesh file {path}")
+    if path.suffix.lower() == ".ply":
+        _check_length(path)
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         mesh = o3d.io.read_triangle_mesh(path)
     if not len(mesh.triangles):
@@ -106,6 +113,28 @@ def _read(path: Path):  # type: ignore[no-untyped-def]  # open3d ships no types
     if not np.isfinite(np.asarray(mesh.vertices)).all():
         raise MeshFileError(f"{path} holds vertices that are not finite numbers; is it cut short?")
     return mesh
+
+
+def _check_length(path: Path) -> None:
+    """Refuse a PLY file that is shorter than its header promises: open3d silently reads what is there."""
+    content = path.read_bytes()
+    header, mark, body = content.partition(b"end_header\n")
+    if not mark:
+        header, mark, body = content.partition(b"end_header\r\n")
+    least, n_lines, count = 0, 0, 0
+    for line in header.decode("ascii", errors="replace").splitlines():
+        words = line.split()
+        if words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
+            count = int(words[2])
+            n_lines += count
+        elif words[:2] == ["property", "list"] and len(words) == 5:
+            # The shortest list of a mesh is a triangle.
+            least += count * (_PLY_BYTES.get(words[2], 0) + 3 * _PLY_BYTES.get(words[3], 0))
+        elif words[:1] == ["property"] and len(words) == 3:
+            least += count * _PLY_BYTES.get(words[1], 0)
+    is_text = b"format ascii" in header
+    if not mark or (body.count(b"\n") + 1 < n_lines if is_text else len(body) < least):
+        raise MeshFileError(f"{path} ends before the data that its header announces; is it cut short?")
 
 
 def _check_format(path: Path) -> None:

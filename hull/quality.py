@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Integer
 from capture.camera import Camera
 from hull.bounds import Bounds, bounds_from_tables
 from hull.carve import carve
+from hull.cleaning import face_pieces, piece_volumes
 from hull.diagnosis import why_empty
 from hull.errors import HullError
 from hull.rays import RayScene
@@ -100,15 +101,15 @@ def camera_disagreements(
     grid = grid_over(box, voxel_m)
     blocks = carve(tables, rule, grid, votes=votes)
     if not blocks.n_voxels:
-        raise HullError(why_empty(tables, rule, box))
+        raise HullError(why_empty(tables, rule, box.low, box.high))
     surface = binary_surface(blocks)
     # Exits are those of every camera alike, so the vertices stay in the middle where two votes are needed.
-    vertices = (
-        cross_exactly(surface, grid, tables)
-        if votes == 1
-        else grid.centres(0.5 * (surface.inner + surface.outer).T).T
-    )
-    scene = RayScene(vertices, surface.faces)
+    middle = 0.5 * (grid.centres(surface.inner.T) + grid.centres(surface.outer.T)).T
+    vertices = cross_exactly(surface, grid, tables) if votes == 1 else middle
+    # With a vote to spare there are more phantoms; the person is the largest piece.
+    label = face_pieces(surface.faces, len(vertices))
+    largest = int(np.argmax(piece_volumes(vertices, surface.faces, label)))
+    scene = RayScene(vertices, surface.faces[label == largest])
     shares = []
     for table in tables:
         camera, image = cameras[table.camera_idx], images[table.camera_idx]

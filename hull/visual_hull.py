@@ -76,7 +76,7 @@ def build_hull(
     rule = witness_rule(tables, bounds.centre)
     blocks = carve(tables, rule, grid)
     if not blocks.n_voxels:
-        raise HullError(why_empty(tables, rule, bounds))
+        raise HullError(why_empty(tables, rule, bounds.low, bounds.high))
     surface = binary_surface(blocks)
     vertices = cross_exactly(surface, grid, tables)
     vertices, faces = raise_ridges(
