@@ -1,15 +1,18 @@
-"""Clothes for a synthetic person: meshes of their own, cut out of the body's surface, offset, and draped every frame.
+"""Clothes for a synthetic person: meshes cut out of the body's surface, offset, and draped every frame.
 
-A garment is a region of the body in the zero pose (everything above a hem, below a collar, up to a sleeve's end), cut
-along its edges, refined and lifted off the skin. In every frame the lift is worked out anew from the posed body:
+A garment is a region of the body in the zero pose (everything above a hem, below a collar, up to a sleeve's
+end), cut along its edges, refined and lifted off the skin. In every frame the lift is worked out anew from
+the posed body:
 
-- it varies over the garment, smoothly, and drifts as the pose changes, so that it touches in other places each time;
-- cloth rests on what faces up and hangs off what faces down, presses in where the body moves towards it and trails
-  behind (that is what a method that looks under clothes can live on);
+- it varies over the garment, smoothly, and drifts as the pose changes, so that it touches in other places
+  each time;
+- cloth rests on what faces up and hangs off what faces down, presses in where the body moves towards it and
+  trails behind (that is what a method that looks under clothes can live on);
 - folds run across it, and loose garments bridge the hollows (armpit, crotch, behind the knee);
 - it is nowhere nearer to the skin than `least_m`.
 
-No physics: rules. The edges are closed by a rim down to the skin, so garment and body together are a solid outside.
+No physics: rules. The edges are closed by a rim down to the skin, so garment and body together are a solid
+outside.
 """
 
 from __future__ import annotations
@@ -37,10 +40,10 @@ class Landmarks:
 
     joints: Float[np.ndarray, "24 3"]
 
-    def __getitem__(self, name: str) -> Float[np.ndarray, "3"]:
+    def __getitem__(self, name: str) -> Float[np.ndarray, " 3"]:
         return self.joints[JOINT[name]]
 
-    def along_arm(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    def along_arm(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """0 at the shoulder joint, 1 at the wrist, of the arm on the point's side; below 0 in the trunk."""
         out = np.empty(len(points))
         for side, here in (("left", points[:, 0] >= 0), ("right", points[:, 0] < 0)):
@@ -48,7 +51,7 @@ class Landmarks:
             out[here] = (points[here] - self[f"{side}_shoulder"]) @ arm / (arm @ arm)
         return out
 
-    def along_leg(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    def along_leg(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """0 at the height of the hip joints, 1 at the knee, 2 at the ankle; negative above."""
         heights = [0.5 * (self[f"left_{j}"][1] + self[f"right_{j}"][1]) for j in ("ankle", "knee", "hip")]
         above = np.maximum(points[:, 1] - heights[2], 0.0) / (heights[2] - heights[1])
@@ -64,18 +67,18 @@ class Landmarks:
 class Cut:
     """A garment before it is worn.
 
-    inside: metres inside the garment's edge for points of the zero pose (negative outside; only the sign and the slope
-    near zero matter). least_m: nowhere thinner. ease_m: mean extra room where it is loosest. looseness: 0..1 of that
-    room at points of the zero pose. bridge: how many smoothing steps of about a centimetre it spans hollows with.
-    fold_m: height of folds. colours: cloth's two tones. stripes_m: their width, 0: none. lively: 1 cloth that hangs and
-    drifts, 0 a thing that keeps its shape.
+    inside: metres inside the garment's edge for points of the zero pose (negative outside; only the sign and
+    the slope near zero matter). least_m: nowhere thinner. ease_m: mean extra room where it is loosest.
+    looseness: 0..1 of that room at points of the zero pose. bridge: how many smoothing steps of about a
+    centimetre it spans hollows with. fold_m: height of folds. colours: cloth's two tones. stripes_m: their
+    width, 0: none. lively: 1 cloth that hangs and drifts, 0 a thing that keeps its shape.
     """
 
     name: str
-    inside: Callable[[Float[np.ndarray, "n 3"], Landmarks], Float[np.ndarray, "n"]]
+    inside: Callable[[Float[np.ndarray, "n 3"], Landmarks], Float[np.ndarray, " n"]]
     least_m: float
     ease_m: float
-    looseness: Callable[[Float[np.ndarray, "n 3"], Landmarks], Float[np.ndarray, "n"]]
+    looseness: Callable[[Float[np.ndarray, "n 3"], Landmarks], Float[np.ndarray, " n"]]
     bridge: int
     fold_m: float
     colours: tuple[tuple[int, int, int], tuple[int, int, int]]
@@ -85,15 +88,15 @@ class Cut:
 
 @dataclass(frozen=True)
 class Garment:
-    """A garment cut for one body: G outer vertices as mixtures of body vertices, and its fixed random fields."""
+    """A garment cut for one body: G outer vertices as mixtures of body vertices, and its random fields."""
 
     cut: Cut
     from_body: sp.csr_array
     """(G V): outer vertices on the skin = from_body @ body vertices."""
     faces: Integer[np.ndarray, "f 3"]
     """Outer faces, then the rim's; indices from G on are the rim's foot, `rim` repeated under the skin."""
-    rim: Integer[np.ndarray, "r"]
-    room_m: Float[np.ndarray, "G"]
+    rim: Integer[np.ndarray, " r"]
+    room_m: Float[np.ndarray, " G"]
     """Extra room at each vertex (m) when nothing moves."""
     waves: Float[np.ndarray, "G k 2"]
     """Sine and cosine of the k slow fields that make the room drift."""
@@ -112,7 +115,7 @@ def cut_out(
     landmarks: Landmarks,
     rng: np.random.Generator,
 ) -> Garment:
-    """The garment cut out of a body in the zero pose (m), refined once, its random fields drawn from `rng`."""
+    """The garment cut out of a body in the zero pose (m), refined, its random fields drawn from `rng`."""
     from_body, patch = _refined(len(template), faces, cut.inside(template, landmarks) > -0.03)
     inside = cut.inside(from_body @ template, landmarks)
     onto, patch = _clipped(inside, patch)
@@ -154,15 +157,15 @@ def drape(
     posed: Float[np.ndarray, "v 3"],
     body_faces: Integer[np.ndarray, "f 3"],
     velocity: Float[np.ndarray, "v 3"],
-    up: Float[np.ndarray, "3"],
+    up: Float[np.ndarray, " 3"],
     moment: float,
     under: Float[np.ndarray, " v"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " v"]]:
-    """Vertices (outer, then the rim's foot) on the posed body (m), and how high the body is covered now (m a vertex).
+    """Vertices (outer, then the rim's foot) on the posed body, and how high each body vertex is covered (m).
 
-    velocity: metres a frame of the body's vertices (the cloth trails behind). up: unit, the posed body's frame.
-    moment: what the slow drift and the folds follow, in radians; about one a second of vigorous movement. under: how
-    high what is worn already stands over the skin: this garment goes over it.
+    velocity: metres a frame of the body's vertices (the cloth trails behind). up: unit, the posed body's
+    frame. moment: what the slow drift and the folds follow, in radians; about one a second of vigorous
+    movement. under: how high what is worn already stands over the skin: this garment goes over it.
     """
     cut = garment.cut
     skin = garment.from_body @ posed
@@ -171,7 +174,8 @@ def drape(
 
     # Cloth lies on what faces up (0) and hangs off what faces down (1).
     hanging = 0.5 - 0.5 * (flat_normals @ up)
-    # Where it is held off just now (1) and where it lies on (0): wanders over the garment as the person moves.
+    # Where it is held off just now (1) and where it lies on (0): wanders over the garment as the person
+    # moves.
     amplitudes = _turned(garment.drift, moment)
     drifting = np.einsum("nkc,kc->n", garment.waves, amplitudes) / np.sqrt(len(amplitudes))
     held_off = 0.5 + 0.5 * np.tanh(1.3 * drifting)
@@ -208,21 +212,21 @@ def drape(
 
 
 def _highest(from_body: sp.csr_array, height: Float[np.ndarray, " n"]) -> Float[np.ndarray, " v"]:
-    """The largest height among the garment's vertices that a body vertex takes part in; 0 where there is none."""
+    """The largest height among the garment's vertices that a body vertex takes part in; 0 without any."""
     out = np.zeros(from_body.shape[1])
     rows = np.repeat(np.arange(from_body.shape[0]), np.diff(from_body.indptr))
     np.maximum.at(out, from_body.indices, height[rows])
     return out
 
 
-# -- cutting ------------------------------------------------------------------------------------------------------
+# -- cutting -------------------------------------------------------------------------------------------------
 
 
 def _refined(n_vertices: int, faces: np.ndarray, wanted: np.ndarray) -> tuple[sp.csr_array, np.ndarray]:
-    """Faces with a wanted corner, each split in four at its edges' middles: (mixing matrix (N V), faces (M 3)).
+    """Faces with a wanted corner, split in four at their edges' middles: (mixing (N V), faces (M 3)).
 
-    The body's triangles stay flat, so that what is lifted off them is outside of them; a centimetre between vertices is
-    what folds need.
+    The body's triangles stay flat, so that what is lifted off them is outside of them; a centimetre between
+    vertices is what folds need.
     """
     chosen = faces[wanted[faces].any(1)].astype(np.int64)
     corners = np.unique(chosen)
@@ -244,7 +248,7 @@ def _refined(n_vertices: int, faces: np.ndarray, wanted: np.ndarray) -> tuple[sp
 
 
 def _clipped(inside: np.ndarray, faces: np.ndarray) -> tuple[sp.csr_array, np.ndarray]:
-    """The part of a triangle mesh where `inside` > 0: (mixing (M N), faces); cut edges get a vertex at the zero."""
+    """The part of a mesh where `inside` > 0: (mixing (M N), faces); cut edges get a vertex at the zero."""
     sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges, edge_of = np.unique(np.sort(sides, 1), axis=0, return_inverse=True)
     edge_of = edge_of.reshape(3, len(faces)).T
@@ -302,7 +306,7 @@ def _boundary(faces: np.ndarray) -> np.ndarray:
 
 
 def _averaging(n: int, faces: np.ndarray, edge: np.ndarray) -> sp.csr_array:
-    """(N N): the mean of a vertex's neighbours; on the garment's edge, of its two neighbours along the edge."""
+    """(N N): the mean of a vertex's neighbours; on the garment's edge, of the two along the edge."""
     sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     on_edge = np.zeros(n, bool)
     on_edge[edge] = True
@@ -315,7 +319,7 @@ def _averaging(n: int, faces: np.ndarray, edge: np.ndarray) -> sp.csr_array:
     return sp.csr_array(sp.diags_array(1.0 / np.maximum(total, 1.0)) @ links)
 
 
-# -- fields -------------------------------------------------------------------------------------------------------
+# -- fields --------------------------------------------------------------------------------------------------
 
 
 def _directions(rng: np.random.Generator, n: int) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Off-screen OpenGL: choose the back end before anything imports it, and find out whether it really draws.
 
-pyrender decides on its GL back end when it is imported and a driver that cannot draw may end the whole process
-without a Python error. So the choice is made here, in one place, and the question "does it work?" is put to a
-child process which draws a triangle and looks at the pixels.
+pyrender decides on its GL back end when it is imported and a driver that cannot draw may end the whole
+process without a Python error. So the choice is made here, in one place, and the question "does it work?" is
+put to a child process which draws a triangle and looks at the pixels.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class GlError(RuntimeError):
 class GlReport:
     """What the probe found.
 
-    `platform` is the PyOpenGL back end, `renderer` and `version` are the driver's own words, `problem` is None where
-    a triangle was really drawn and one sentence, with the fixing command, where not.
+    `platform` is the PyOpenGL back end, `renderer` and `version` are the driver's own words, `problem` is
+    None where a triangle was really drawn and one sentence, with the fixing command, where not.
     """
 
     platform: str
@@ -44,9 +44,9 @@ class GlReport:
 def choose_platform() -> str:
     """Settle PyOpenGL's back end for this process and return its name.
 
-    EGL on Linux unless the user chose one in PYOPENGL_PLATFORM; elsewhere PyOpenGL's own default ("" is returned).
-    Must run before the first import of pyrender or OpenGL: afterwards the choice has no effect, which is an error
-    when another back end has been loaded already.
+    EGL on Linux unless the user chose one in PYOPENGL_PLATFORM; elsewhere PyOpenGL's own default ("" is
+    returned). Must run before the first import of pyrender or OpenGL: afterwards the choice has no effect,
+    which is an error when another back end has been loaded already.
     """
     wanted = os.environ.get("PYOPENGL_PLATFORM")
     if wanted is None:
@@ -62,7 +62,7 @@ def choose_platform() -> str:
 
 
 def import_pyrender() -> ModuleType:
-    """pyrender with the back end chosen. It is slow to import (about a second), so only functions that draw call it."""
+    """pyrender with the back end chosen. It imports slowly (a second): only functions that draw call this."""
     choose_platform()
     with warnings.catch_warnings():
         # pyrender and the PyOpenGL it pins warn about old spellings of their own.
@@ -72,7 +72,7 @@ def import_pyrender() -> ModuleType:
 
 
 def probe(timeout_s: float = 60.0) -> GlReport:
-    """Let a child process draw a triangle, and report the driver or what went wrong. Never raises for a bad driver."""
+    """Let a child process draw a triangle; report the driver or what went wrong, never raise for it."""
     room = str(Path(__file__).resolve().parent.parent)
     environment = dict(os.environ)
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, [room, environment.get("PYTHONPATH", "")]))

@@ -1,8 +1,8 @@
 """Light worked out at the vertices: matte shading and cast shadows, baked into the colours once a frame.
 
-A synthetic film draws the same dressed person for every camera. Shading in a software driver costs by the triangle and
-by the camera; matte light does not depend on the camera, so it is computed here once and drawn flat ten times as fast,
-and there is time left for shadows.
+A synthetic film draws the same dressed person for every camera. Shading in a software driver costs by the
+triangle and by the camera; matte light does not depend on the camera, so it is computed here once and drawn
+flat ten times as fast, and there is time left for shadows.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ EXPOSURE = 0.36
 
 
 def bake(surfaces: Sequence[Surface], lights: Sequence[Light], ambient: float = 0.42) -> list[Surface]:
-    """The surfaces with light and shadow in their colours; draw them with no lights. ambient: share from everywhere.
+    """The surfaces with light and shadow in their colours; draw them with no lights.
 
-    Ambient light comes somewhat more from above (up is taken from the lights' mean direction), as in any room.
+    ambient: share of light from everywhere, somewhat more from where the lights are on average (above).
     """
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene(nthreads=0)
     for surface in surfaces:
         scene.add_triangles(
-            o3d.core.Tensor(surface.vertices.astype(np.float32)),
-            o3d.core.Tensor(surface.faces.astype(np.uint32)),
+            o3d.core.Tensor.from_numpy(surface.vertices.astype(np.float32)),
+            o3d.core.Tensor.from_numpy(surface.faces.astype(np.uint32)),
         )
     points = np.concatenate([s.vertices for s in surfaces])
     normals = np.concatenate([vertex_normals(s.vertices, s.faces) for s in surfaces])
@@ -68,4 +68,4 @@ def _shadowed(
 
     start = points + SHADOW_START_M * (normals + direction)
     rays = np.concatenate([start, np.broadcast_to(direction, start.shape)], 1).astype(np.float32)
-    return scene.test_occlusions(o3d.core.Tensor(rays)).numpy()  # type: ignore[attr-defined]
+    return scene.test_occlusions(o3d.core.Tensor.from_numpy(rays)).numpy()  # type: ignore[attr-defined]

@@ -1,8 +1,8 @@
-"""Motions for synthetic recordings, by name: smooth joint rotations over time, and the feet kept on the floor.
+"""Motions for synthetic recordings, by name: smooth joint rotations over time, feet kept on the floor.
 
-Each motion is a function of the phase 0..1 that turns a few joints of a standing person; a seed varies its size and
-timing and adds the small sway that nobody stands without. The three of the BUFF captures that the paper reports
-(tilt and twist, hips, shoulder mill) are here, and others that a hull finds harder.
+Each motion is a function of the phase 0..1 that turns a few joints of a standing person; a seed varies its
+size and timing and adds the small sway that nobody stands without. The three of the BUFF captures that the
+paper reports (tilt and twist, hips, shoulder mill) are here, and others that a hull finds harder.
 """
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ Joints = dict[str, tuple[float, float, float]]
 
 @dataclass(frozen=True)
 class Motion:
-    """A motion before it is put on the floor. pose: rad; stance: which ankle stays in place (left, right), sums to 1."""
+    """A motion before it is put on the floor.
+
+    pose: rad. stance: which ankle stays in place (left, right), sums to 1.
+    """
 
     name: str
     pose: Float[np.ndarray, "t j 3"]
@@ -228,7 +231,7 @@ def make_motion(name: str, n_frames: int, seed: int = 0) -> Motion:
 
 
 def _sway(phases: np.ndarray, rng: np.random.Generator) -> Float[np.ndarray, "t j 3"]:
-    """Slow individual turns of every joint above the ankles, about 1.5 degrees; and a posture of one's own."""
+    """Slow turns of every joint above the ankles, about 1.5 degrees, and a posture of one's own."""
     scale = np.full(N_JOINTS, 0.025)
     for name in ("pelvis", "left_ankle", "right_ankle", "left_foot", "right_foot", "left_hand", "right_hand"):
         scale[JOINT[name]] = 0.006
@@ -260,11 +263,12 @@ def joint_positions(
 
 
 def stance_travel(motion: Motion, joints: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "t 3"]:
-    """Horizontal translation (m, body frame, y = 0) that keeps the standing ankle in place, over the film's middle.
+    """Horizontal translation (m, body frame, y = 0) that keeps the standing ankle in place, over the film's
+    middle.
 
-    The step between two frames undoes what the standing foot would have slid; over the whole film the pelvis is on
-    average above the origin, so that a walk stays within the cameras' view. Heights are for the caller, who knows the
-    soles.
+    The step between two frames undoes what the standing foot would have slid; over the whole film the pelvis
+    is on average above the origin, so that a walk stays within the cameras' view. Heights are for the caller,
+    who knows the soles.
     """
     places = joint_positions(motion.pose, joints)
     ankles = places[:, [JOINT["left_ankle"], JOINT["right_ankle"]]]

@@ -1,7 +1,8 @@
-"""The result over what the camera saw: the body on the picture, or on the silhouette where there is no picture.
+"""The result over what the camera saw: on the picture, or on the silhouette where there is no picture.
 
-Lenses: pictures and silhouettes are taken undistorted, as `Recording.picture` and `Recording.silhouettes` hand them
-out, and the body is drawn by the pinhole camera that belongs to them. The picture is warped, never the drawing.
+Lenses: pictures and silhouettes are taken undistorted, as `Recording.picture` and `Recording.silhouettes`
+hand them out, and the body is drawn by the pinhole camera that belongs to them. The picture is warped, never
+the drawing.
 """
 
 from __future__ import annotations
@@ -34,10 +35,11 @@ def overlay(
     *,
     strength: float = 0.62,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """RGB: the surfaces drawn by `camera` (a pinhole), blended over the undistorted picture, with their outline.
+    """RGB: the surfaces drawn by `camera` (a pinhole) over the undistorted picture, with their outline.
 
-    Without a picture the silhouette is drawn in white on grey (unknown pixels darker); without either, plain grey.
-    strength: how opaque the body is, 0..1. ValueError where picture or silhouette has another size than the camera.
+    Without a picture the silhouette is drawn in white on grey (unknown pixels darker); without either, plain
+    grey. strength: how opaque the body is, 0..1. ValueError where picture or silhouette has another size than
+    the camera.
     """
     behind = _background(camera, picture, silhouette)
     if not surfaces:
@@ -48,7 +50,7 @@ def overlay(
 def blend_drawing(
     behind: UInt8[np.ndarray, "h w 3"], drawing: Picture, strength: float = 0.62
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A drawing over a picture: see-through, edges smooth, and its outline drawn on the pixels just inside it."""
+    """A drawing over a picture: see-through, edges smooth, its outline on the pixels just inside it."""
     out = behind.copy()
     rows, columns = _box(drawing.coverage)
     part = out[rows, columns].astype(np.float32)
@@ -62,7 +64,7 @@ def blend_drawing(
 
 
 def outline(mask: Bool[np.ndarray, "h w"], width_px: int = 0) -> Bool[np.ndarray, "h w"]:
-    """The mask's pixels within `width_px` of its outside; where 0, a width that stays visible at the picture's size."""
+    """The mask's pixels within `width_px` of its outside; 0: a width that suits the picture's size."""
     if width_px == 0:
         width_px = max(1, round(min(mask.shape) / 500))
     size = 2 * width_px + 1
@@ -94,7 +96,8 @@ def overlay_frames(
     longest_px: int = 1280,
     captions: Sequence[str] | None = None,
 ) -> Iterator[UInt8[np.ndarray, "h2 w2 3"]]:
-    """Frames for `video.write_video`: for every (surfaces, picture, silhouette) the overlay, made no larger than needed.
+    """Frames for `video.write_video`: for every (surfaces, picture, silhouette) the overlay, made no larger
+    than needed.
 
     captions: a line of text a frame (its number, a warning), written into the lower left corner.
     """
@@ -129,7 +132,9 @@ def captioned(image: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarray,
 
 
 def crop_around(masks: Sequence[Bool[np.ndarray, "h w"]], margin: float = 0.08) -> tuple[slice, slice] | None:
-    """The part of a picture that holds all masks' pixels, with a margin (share of its larger side); None: no pixel."""
+    """The part of a picture that holds all masks' pixels, with a margin (share of its larger side); None: no
+    pixel.
+    """
     together = np.logical_or.reduce(list(masks))
     if not together.any():
         return None

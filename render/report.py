@@ -1,6 +1,8 @@
-"""A run's report: one HTML file with everything in it (pictures inlined), readable without a network, light or dark.
+"""A run's report: one HTML file with everything in it (pictures inlined), readable without a network, light
+or dark.
 
-The page knows nothing of the pipeline: it lays out what `ReportData` holds, so that the door decides what is told.
+The page knows nothing of the pipeline: it lays out what `ReportData` holds, so that the door decides what is
+told.
 """
 
 from __future__ import annotations
@@ -27,7 +29,9 @@ class Image:
 
 @dataclass(frozen=True)
 class Row:
-    """One row of the contact sheet: a title (frame, camera) and its pictures, in the order of the sheet's headers."""
+    """One row of the contact sheet: a title (frame, camera) and its pictures, in the order of the sheet's
+    headers.
+    """
 
     title: str
     images: tuple[Image | None, ...]
@@ -35,7 +39,8 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """rows: cells are text or numbers; numbers are shown with `digits` after the point and stand to the right.
+    """rows: cells are text or numbers; numbers are shown with `digits` after the point and stand to the
+    right.
 
     note: a sentence under the table: what is measured, in which unit, better up or down.
     """
@@ -51,9 +56,10 @@ class Table:
 class ReportData:
     """What a report shows, top to bottom.
 
-    title; subtitle: a sentence; headline: the few (name, value) that matter most, shown large; problems: a sentence
-    each, what went wrong or was found odd (empty: the page says so); facts: (name, value) of the run; tables;
-    sheet_headers and sheet: the contact sheet; films: (caption, path relative to the report's folder) of MP4 files.
+    title; subtitle: a sentence; headline: the few (name, value) that matter most, shown large; problems: a
+    sentence each, what went wrong or was found odd (empty: the page says so); facts: (name, value) of the
+    run; tables; sheet_headers and sheet: the contact sheet; films: (caption, path relative to the report's
+    folder) of MP4 files.
     """
 
     title: str
@@ -69,10 +75,11 @@ class ReportData:
 
 
 def write_report(path: Path | str, data: ReportData, *, image_px: int = 420) -> Path:
-    """Write the page and return its path; it appears whole or not at all. image_px: longest side of the pictures.
+    """Write the page and return its path; it appears whole or not at all. image_px: longest side of the
+    pictures.
 
-    Photographs become JPEG, flat pictures (silhouettes) PNG, whichever is smaller. ValueError where a table's row or
-    a sheet's row has another length than its headers.
+    Photographs become JPEG, flat pictures (silhouettes) PNG, whichever is smaller. ValueError where a table's
+    row or a sheet's row has another length than its headers.
     """
     path = Path(path)
     for table in data.tables:
@@ -84,7 +91,8 @@ def write_report(path: Path | str, data: ReportData, *, image_px: int = 420) -> 
     for line in data.sheet:
         if len(line.images) != len(data.sheet_headers):
             raise ValueError(
-                f"contact sheet, row {line.title!r}: {len(line.images)} pictures for {len(data.sheet_headers)} headers"
+                f"contact sheet, row {line.title!r}: {len(line.images)} pictures for "
+                f"{len(data.sheet_headers)} headers"
             )
     page = render_page(data, image_px)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,10 @@
-"""Draw meshes as a recording's own camera sees them: colour, silhouette and depth, off screen, through pyrender.
+"""Draw meshes as a recording's own camera sees them: colour, silhouette and depth, off screen, through
+pyrender.
 
-The one place that knows OpenGL's axes (y up, z backwards) and its pixel rectangle (the first pixel spans 0 to 1):
-everything else speaks `capture.Camera` (y down, z forward, (0, 0) the centre of the first pixel). The clip matrix is
-derived from the camera's exact 3x4 projection, so skew, unequal focal lengths and any principal point are exact.
+The one place that knows OpenGL's axes (y up, z backwards) and its pixel rectangle (the first pixel spans 0 to
+1): everything else speaks `capture.Camera` (y down, z forward, (0, 0) the centre of the first pixel). The
+clip matrix is derived from the camera's exact 3x4 projection, so skew, unequal focal lengths and any
+principal point are exact.
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ NEAREST_M = 0.02
 class Surface:
     """A triangle mesh with its look.
 
-    vertices: metres, world frame. colours: RGB a vertex, or None for `colour` everywhere. roughness: 0 mirror, 1 chalk.
+    vertices: metres, world frame. colours: RGB a vertex, or None for `colour` everywhere. roughness: 0
+    mirror, 1 chalk.
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -40,18 +43,21 @@ class Surface:
 
 @dataclass(frozen=True)
 class Light:
-    """Light from infinitely far. direction: the way it shines, world frame (any length). intensity: pyrender's units."""
+    """Light from infinitely far. direction: the way it shines, world frame (any length). intensity:
+    pyrender's units.
+    """
 
-    direction: Float[np.ndarray, "3"]
+    direction: Float[np.ndarray, " 3"]
     intensity: float
     colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Picture:
-    """What a camera sees. colour: RGB with anti-aliased edges on black; coverage: share of the pixel that is covered,
-    0..255 (blend with it); mask: the surface is hit by the ray through the pixel's centre; depth: metres along the
-    optical axis, 0 where nothing is hit."""
+    """What a camera sees. colour: RGB with anti-aliased edges on black; coverage: share of the pixel that is
+    covered, 0..255 (blend with it); mask: the surface is hit by the ray through the pixel's centre; depth:
+    metres along the optical axis, 0 where nothing is hit.
+    """
 
     colour: UInt8[np.ndarray, "h w 3"]
     coverage: UInt8[np.ndarray, "h w"]
@@ -61,8 +67,9 @@ class Picture:
 
 @functools.cache
 def _offscreen() -> Any:
-    """The process's one GL context. pyrender ends the whole display when any of its renderers is deleted, so there is
-    one for all, made at the first picture; its framebuffer follows the size asked for."""
+    """The process's one GL context. pyrender ends the whole display when any of its renderers is deleted, so
+    there is one for all, made at the first picture; its framebuffer follows the size asked for.
+    """
     pyrender = import_pyrender()
     try:
         return pyrender.OffscreenRenderer(16, 16)
@@ -112,7 +119,9 @@ def clip_from_world(
 
 
 def lights_of_camera(camera: Camera) -> tuple[Light, ...]:
-    """A key light over the camera's left shoulder and a weak one from its right: shapes read well from anywhere."""
+    """A key light over the camera's left shoulder and a weak one from its right: shapes read well from
+    anywhere.
+    """
     axes = camera.camera_from_world[:3, :3]
     return (
         Light(axes.T @ np.array([0.55, 0.6, 1.0]), 2.6),
@@ -120,7 +129,7 @@ def lights_of_camera(camera: Camera) -> tuple[Light, ...]:
     )
 
 
-def studio_lights(up: Float[np.ndarray, "3"]) -> tuple[Light, ...]:
+def studio_lights(up: Float[np.ndarray, " 3"]) -> tuple[Light, ...]:
     """Four soft lights that stay where they are in the room: a key, two fills and one from above."""
     up = np.asarray(up, float) / np.linalg.norm(up)
     side = np.cross(up, [0.3, 0.5, 0.8] if abs(up[1]) < 0.9 else [1.0, 0.2, 0.1])
@@ -137,8 +146,8 @@ def studio_lights(up: Float[np.ndarray, "3"]) -> tuple[Light, ...]:
 class Stage:
     """Meshes on the graphics card, ready for any number of cameras.
 
-    Positions are taken relative to the meshes' middle before they become single precision, so that a world whose
-    origin lies far away costs no accuracy.
+    Positions are taken relative to the meshes' middle before they become single precision, so that a world
+    whose origin lies far away costs no accuracy.
     """
 
     def __init__(self, surfaces: Sequence[Surface], ambient: float = 0.28) -> None:
@@ -175,7 +184,8 @@ class Stage:
         return pyrender.Mesh([primitive])
 
     def colour(self, camera: Camera, lights: Sequence[Light] | None = None) -> Picture:
-        """The picture, lit by `lights`: those of `lights_of_camera` where None; the colours as they are where empty.
+        """The picture, lit by `lights`: those of `lights_of_camera` where None; the colours as they are where
+        empty.
 
         ValueError for a camera with distortion.
         """
@@ -202,13 +212,13 @@ class Stage:
         return depth > 0, depth
 
     def _depth_at_centres(self, camera: Camera) -> Float32[np.ndarray, "h w"]:
-        """Depth without multisampling: with it, pyrender's depth is that of a sample off the pixel's centre."""
+        """Depth without multisampling: with it, the depth is that of a sample off the pixel's centre."""
         pyrender = import_pyrender()
         self._place(camera)
         offscreen = _offscreen()
         offscreen.viewport_width, offscreen.viewport_height = self._window[2:]
         flags = pyrender.RenderFlags.SEG | pyrender.RenderFlags.SKIP_CULL_FACES
-        _, depth = offscreen.render(self._scene, flags, {node: 255 for node in self._nodes})
+        _, depth = offscreen.render(self._scene, flags, dict.fromkeys(self._nodes, 255))
         return self._pasted(depth, camera)
 
     def _pasted(self, part: np.ndarray, camera: Camera) -> np.ndarray:
@@ -249,8 +259,8 @@ class Stage:
 def _window_around(pixels: Float[np.ndarray, "n 2"], size: tuple[int, int]) -> tuple[int, int, int, int]:
     """(column, row, width, height) of the part of a picture that holds these pixels with a margin.
 
-    A person fills a tenth of a picture; drawing in software costs by the pixel. Steps of 32 pixels, so that the
-    framebuffer is seldom made anew.
+    A person fills a tenth of a picture; drawing in software costs by the pixel. Steps of 32 pixels, so that
+    the framebuffer is seldom made anew.
     """
     window = []
     for low, high, limit in zip(pixels.min(0) - 3, pixels.max(0) + 3, size, strict=True):
@@ -270,7 +280,9 @@ class Renderer:
     def colour(
         self, meshes: Sequence[Surface], camera: Camera, lights: Sequence[Light] | None = None
     ) -> Picture:
-        """Lit picture, mask and depth of the meshes as `camera` (a pinhole of this renderer's size) sees them."""
+        """Lit picture, mask and depth of the meshes as `camera` (a pinhole of this renderer's size) sees
+        them.
+        """
         self._check(camera)
         return Stage(meshes).colour(camera, lights)
 

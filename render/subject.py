@@ -1,7 +1,8 @@
-"""A clothed synthetic person whose naked body is known: a body drawn from the model's spread, personal detail that the
-model cannot say, hair, shoes and an outfit by name.
+"""A clothed synthetic person whose naked body is known: a body drawn from the model's spread, personal detail
+that the model cannot say, hair, shoes and an outfit by name.
 
-The detail matters: a subject made by the body model alone would let a method that trusts the model win too easily.
+The detail matters: a subject made by the body model alone would let a method that trusts the model win too
+easily.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from .scene import Surface, vertex_normals
 from .wardrobe import OUTFITS, hair, shoes
 
 DETAIL_MEAN_M = 0.0025
-"""Mean size of the personal detail over the body (m): what real people differ by within a small shape space."""
+"""Mean size of the personal detail over the body (m)."""
 SKIN_TONES = ((236, 200, 176), (214, 170, 140), (176, 128, 98), (118, 80, 60), (244, 212, 190))
 BARE, CLOTH, SHOE, HAIR = 0, 1, 2, 3
 """Values of `Subject.covered`."""
@@ -39,11 +40,11 @@ class Subject:
     """
 
     body: BodyModel
-    betas: Float[np.ndarray, "b"]
+    betas: Float[np.ndarray, " b"]
     template: Float[np.ndarray, "v 3"]
     joints: Float[np.ndarray, "j 3"]
     garments: tuple[Garment, ...]
-    covered: Int[np.ndarray, "v"]
+    covered: Int[np.ndarray, " v"]
     skin_colours: UInt8[np.ndarray, "v 3"]
 
     @property
@@ -52,7 +53,7 @@ class Subject:
         return region_of_vertices(self.body)
 
     def posed(
-        self, pose: Float[np.ndarray, "j 3"], translation: Float[np.ndarray, "3"]
+        self, pose: Float[np.ndarray, "j 3"], translation: Float[np.ndarray, " 3"]
     ) -> Float[np.ndarray, "v 3"]:
         """The naked body's vertices in a pose (rad), moved by a translation (m): linear blend skinning."""
         turns = axis_angle_to_matrix(pose)
@@ -64,10 +65,12 @@ class Subject:
         self,
         posed: Float[np.ndarray, "v 3"],
         velocity: Float[np.ndarray, "v 3"],
-        up: Float[np.ndarray, "3"],
+        up: Float[np.ndarray, " 3"],
         moment: float,
     ) -> list[Surface]:
-        """The posed body and what it wears, ready to be drawn. Arguments as `garments.drape`; any upright frame."""
+        """The posed body and what it wears, ready to be drawn. Arguments as `garments.drape`; any upright
+        frame.
+        """
         surfaces = [Surface(posed, self.body.faces, self.skin_colours, roughness=0.65)]
         covered = np.zeros(len(posed))
         for garment in self.garments:
@@ -82,15 +85,16 @@ def make_subject(
     seed: int,
     garment: str = "tshirt-trousers",
     *,
-    betas: Float[np.ndarray, "b"] | None = None,
+    betas: Float[np.ndarray, " b"] | None = None,
     detail_m: float = DETAIL_MEAN_M,
     with_hair: bool = True,
 ) -> Subject:
     """A person drawn from `seed`.
 
-    garment: a name of `wardrobe.OUTFITS`; "none" goes barefoot and bald-headed too, so that the silhouette is the body.
-    betas: shape coefficients (standard deviations); where None they are drawn, held to 2. detail_m: mean size of the
-    displacements outside the model's shape space. SubjectError for an outfit that is not there.
+    garment: a name of `wardrobe.OUTFITS`; "none" goes barefoot and bald-headed too, so that the silhouette is
+    the body. betas: shape coefficients (standard deviations); where None they are drawn, held to 2. detail_m:
+    mean size of the displacements outside the model's shape space. SubjectError for an outfit that is not
+    there.
     """
     if garment not in OUTFITS:
         raise SubjectError(f"no outfit is called {garment!r}; there are: {', '.join(OUTFITS)}")
@@ -148,7 +152,8 @@ def _eligible_parts(body: BodyModel) -> dict[int, np.ndarray]:
 def _detail(
     body: BodyModel, shaped: Float[np.ndarray, "v 3"], mean_m: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "v 3"]:
-    """Smooth displacements along the normal, wavelengths of 8 to 30 cm, freed of what the shape space could say.
+    """Smooth displacements along the normal, wavelengths of 8 to 30 cm, freed of what the shape space could
+    say.
 
     Weaker on face, hands and feet, where a few millimetres are a deformity. Zero where mean_m is 0.
     """

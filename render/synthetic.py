@@ -1,9 +1,10 @@
-"""A synthetic recording: a clothed person with a known body, moving, filmed by a synthetic rig, in the INRIA layout.
+"""A synthetic recording: a clothed person with a known body, moving, filmed by a synthetic rig, in the INRIA
+layout.
 
-    OUT/setup/camNN.txt                                 3x4 projection matrices, pixels from metres, every digit
-    OUT/SilhouettesPictures/cam-NNN/silh_NNNNNN.png     255 person, 0 background, sampled at the pixels' centres
-    OUT/Pictures/cam-NNN/img_NNNNNN.png                 lit colour pictures before a plain studio
-    OUT/truth/truth.npz                                 the naked body of every frame
+    OUT/setup/camNN.txt                               3x4 projection matrices, pixels from metres, all digits
+    OUT/SilhouettesPictures/cam-NNN/silh_NNNNNN.png   255 person, 0 background, sampled at the pixels' centres
+    OUT/Pictures/cam-NNN/img_NNNNNN.png               lit colour pictures before a plain studio
+    OUT/truth/truth.npz                               the naked body of every frame
 
 World: metres, z up, floor at z = 0; the person faces -y in the zero pose.
 """
@@ -11,7 +12,6 @@ World: metres, z up, floor at z = 0; the person faces -y in the zero pose.
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -63,7 +63,9 @@ class SyntheticError(ValueError):
 
 @dataclass(frozen=True)
 class Performance:
-    """A subject in motion, in the world (m, z up). pose, translation: the subject's own frame; vertices: the world."""
+    """A subject in motion, in the world (m, z up). pose, translation: the subject's own frame; vertices: the
+    world.
+    """
 
     subject: Subject
     pose: Float[np.ndarray, "t j 3"]
@@ -114,9 +116,10 @@ def film(
 ) -> Path:
     """Film a person drawn from `seed` and write the recording; returns the truth file's path.
 
-    layout: a name of LAYOUTS; motion: of `motions.MOTIONS`; garment: of `wardrobe.OUTFITS`. sequence: name of a folder
-    between OUT and the pictures, and of the truth file; none, and "truth", where empty. SyntheticError for unknown
-    names and for a folder that holds a recording already (unless `overwrite`: then the old one is removed).
+    layout: a name of LAYOUTS; motion: of `motions.MOTIONS`; garment: of `wardrobe.OUTFITS`. sequence: name of
+    a folder between OUT and the pictures, and of the truth file; none, and "truth", where empty.
+    SyntheticError for unknown names and for a folder that holds a recording already (unless `overwrite`: then
+    the old one is removed).
     """
     out = Path(out)
     if layout not in LAYOUTS:
@@ -223,11 +226,13 @@ def write_truth(path: Path, performance: Performance, settings: dict[str, object
         frame_ids=np.arange(len(performance.vertices)),
         settings=json.dumps(settings),
     )
-    os.replace(partial, path)
+    partial.replace(path)
 
 
 def _make_room(out: Path, overwrite: bool) -> None:
-    """An empty place for the recording: cameras or frames left over from another one would be read as part of it."""
+    """An empty place for the recording: cameras or frames left over from another one would be read as part of
+    it.
+    """
     there = [name for name in OWN_FOLDERS if (out / name).exists()]
     if there and not overwrite:
         raise SyntheticError(

@@ -21,12 +21,13 @@ def write_video(
 ) -> Path:
     """Encode RGB frames (all of one size) to an MP4 and return its path.
 
-    H.264 in 4:2:0 needs even sizes: an odd last column or row is repeated once. The index goes in front of the
-    pictures ("faststart"), so that a browser can start before it has everything. The file is written under a temporary
-    name next to it and renamed, so a film that exists is whole.
+    H.264 in 4:2:0 needs even sizes: an odd last column or row is repeated once. The index goes in front of
+    the pictures ("faststart"), so that a browser can start before it has everything. The file is written
+    under a temporary name next to it and renamed, so a film that exists is whole.
 
-    fps: pictures a second. quality: x264's constant rate factor, lower is better (0 lossless, 20 good). progress: label
-    of a progress bar, none where None. ValueError where there is no frame, or where one has another size or type.
+    fps: pictures a second. quality: x264's constant rate factor, lower is better (0 lossless, 20 good).
+    progress: label of a progress bar, none where None. ValueError where there is no frame, or where one has
+    another size or type.
     """
     import av
     from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc, VideoReformatter
@@ -54,7 +55,8 @@ def write_video(
                     stream.height, stream.width = (n + n % 2 for n in shape[:2])
                     stream.pix_fmt = "yuv420p"
                     stream.options = {"crf": str(quality), "preset": "veryfast"}
-                    # Untagged films are taken for BT.601 or BT.709 by their size: say which, or colours shift.
+                    # Untagged films are taken for BT.601 or BT.709 by their size: say which, or colours
+                    # shift.
                     stream.codec_context.colorspace = Colorspace.ITU709
                     stream.codec_context.color_range = ColorRange.MPEG
                     stream.codec_context.color_primaries = ColorPrimaries.BT709

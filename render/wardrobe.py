@@ -1,4 +1,6 @@
-"""What a synthetic person can wear, by name: each garment's edges, room and colours in terms of the body's joints."""
+"""What a synthetic person can wear, by name: each garment's edges, room and colours in terms of the body's
+joints.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ from jaxtyping import Float
 from .garments import Cut, Landmarks
 
 Points = Float[np.ndarray, "n 3"]
-Values = Float[np.ndarray, "n"]
+Values = Float[np.ndarray, " n"]
 Field = Callable[[Points, Landmarks], Values]
 
 Tones = tuple[tuple[int, int, int], tuple[int, int, int]]
@@ -51,8 +53,9 @@ def _step(values: Values, low: float, high: float) -> Values:
 
 
 def shirt(sleeve: float, hem: float, collar_m: float = 0.02) -> Field:
-    """Torso and arms. sleeve: where it ends along the arm (1: the wrist); hem: along the leg (0: hip joints, negative
-    above); collar_m: metres above the neck joint."""
+    """Torso and arms. sleeve: where it ends along the arm (1: the wrist); hem: along the leg (0: hip joints,
+    negative above); collar_m: metres above the neck joint.
+    """
 
     def inside(points: Points, body: Landmarks) -> Values:
         leg_m = body["left_hip"][1] - body["left_knee"][1]
@@ -85,7 +88,9 @@ def sports_top() -> Field:
 
 
 def trousers(leg: float, waist: float = 0.35) -> Field:
-    """Legs and seat. leg: where they end (1: the knee, 2: the ankle); waist: 0 at the pelvis joint, 1 at spine1."""
+    """Legs and seat. leg: where they end (1: the knee, 2: the ankle); waist: 0 at the pelvis joint, 1 at
+    spine1.
+    """
 
     def inside(points: Points, body: Landmarks) -> Values:
         top = (1 - waist) * body["pelvis"][1] + waist * body["spine1"][1]
