@@ -23,11 +23,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
 
+from capture.colour_difference import CLEAR_LEVELS, departure, foreground, shrunk
 from capture.rig import Rig
-from capture.subject_region import RegionFinder, grown, scaled_size
+from capture.segmentation import segment_small
+from capture.subject_region import RegionFinder, grown
 
 _WORKING_SIDE = 960
-_FOREGROUND_LEVELS = 22
 _STEADY_LEVELS = 8
 _STEADY_SHARE = 0.85
 _N_FREE_FRAMES = 4
@@ -99,6 +100,10 @@ def build_backgrounds(
         for camera_idx, stack in enumerate(samples):
             middle, free = _over_free_frames(stack, outlines[camera_idx], ghosts[camera_idx])
             small[camera_idx][free] = middle[free]
+    for camera_idx, ghost in enumerate(ghosts):
+        _look_behind_ghost(
+            samples[camera_idx], outlines[camera_idx], ghost, patches[camera_idx], small[camera_idx]
+        )
     pictures, trusted = [], []
     for camera_idx, plate in enumerate(plates):
         shape = plate.shape[:2]
@@ -154,23 +159,6 @@ def lifted(plate: Picture, target: Picture) -> Picture:
     return np.clip(np.rint(plate + drift), 0, 255).astype(np.uint8)
 
 
-def departure(picture: Picture, background: Picture) -> UInt8[np.ndarray, "h w"]:
-    """How far (levels, worst channel) each pixel lies outside the background's range over its 3x3 neighbours.
-
-    The range forgives edges that are shifted by up to a pixel: another compression, a plate that was scaled.
-    """
-    kernel = np.ones((3, 3), np.uint8)
-    above = cv2.subtract(picture, cv2.dilate(background, kernel))
-    below = cv2.subtract(cv2.erode(background, kernel), picture)
-    return np.maximum(above, below).max(axis=2)
-
-
-def foreground(picture: Picture, background: Picture) -> UInt8[np.ndarray, "h w"]:
-    """255 where the picture clearly differs from the background, specks removed."""
-    mask = np.where(departure(picture, background) > _FOREGROUND_LEVELS, 255, 0).astype(np.uint8)
-    return cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)).astype(np.uint8)
-
-
 def median_over_time(samples: Samples) -> Picture:
     """(h w 3): the median of (T h w 3), in strips so that no second copy of the samples is made."""
     result = np.empty(samples.shape[1:], np.uint8)
@@ -179,14 +167,6 @@ def median_over_time(samples: Samples) -> Picture:
         strip.partition(len(samples) // 2, axis=0)
         result[row : row + 64] = strip[len(samples) // 2]
     return result
-
-
-def shrunk(picture: Picture, scale: float) -> Picture:
-    """The picture scaled down by area averaging (as it is at scale 1)."""
-    if scale >= 1:
-        return picture
-    size = scaled_size((picture.shape[1], picture.shape[0]), scale)
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
 
 
 def _subject_outlines(
@@ -216,6 +196,30 @@ def _subject_outlines(
                     outline = np.where(ghost, outline & tight, outline)
             outlines[camera_idx].append(outline)
     return [np.stack(camera) for camera in outlines]
+
+
+def _look_behind_ghost(
+    samples: Samples,
+    outlines: Bool[np.ndarray, "t h w"],
+    ghost: Bool[np.ndarray, "h w"],
+    patched: Bool[np.ndarray, "h w"],
+    background: Picture,
+) -> None:
+    """Narrow `outlines` and complete `background` (both in place) where the subject always may stand before
+    a ghost.
+
+    The segmentation itself copes with a background that is not known everywhere; where its masks leave a
+    pixel free often enough, the background there becomes known, and the next round's masks are better.
+    """
+    for _ in range(2):
+        known = ~ghost | patched | _over_free_frames(samples, outlines, ghost)[1]
+        if (~known & outlines.any(axis=0)).sum() < 50:
+            return
+        for time_idx, picture in enumerate(samples):
+            person = segment_small(picture, background, outlines[time_idx], known)
+            outlines[time_idx] &= grown(person, 5) | ~ghost
+        middle, free = _over_free_frames(samples, outlines, ghost)
+        background[free] = middle[free]
 
 
 def _find_ghosts(
@@ -251,8 +255,8 @@ def _find_ghosts(
                 continue
             for camera_idx in range(len(samples)):
                 where = finder.outline(camera_idx, labels == part + 1)
-                zones[camera_idx] |= where & (nearest[camera_idx] > _FOREGROUND_LEVELS // 2)
-                differs = departure(steady[camera_idx], small[camera_idx]) > _FOREGROUND_LEVELS // 2
+                zones[camera_idx] |= where & (nearest[camera_idx] > CLEAR_LEVELS // 2)
+                differs = departure(steady[camera_idx], small[camera_idx]) > CLEAR_LEVELS // 2
                 patches[camera_idx] |= where & differs & (share[camera_idx] >= _STEADY_SHARE)
     return patches, [grown(zone, 3) for zone in zones]
 

@@ -99,7 +99,7 @@ def _paired(rig: Rig, unit: str, path: Path, sizes: Mapping[str, tuple[int, int]
         if camera.size != size:
             raise RecordingError(
                 f"{path}: camera {name} is calibrated for {camera.size[0]}x{camera.size[1]} px, "
-                f"its pictures are {size[0]}x{size[1]} px; use the pictures as calibrated, not cropped or scaled"
+                f"its pictures are {size[0]}x{size[1]} px; use pictures of the calibrated size"
             )
         cameras.append(_renamed(camera, name))
         by_name.pop(camera.name, None)

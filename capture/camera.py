@@ -200,20 +200,15 @@ class Camera:
             )
         if self.is_pinhole:
             return image
+        columns, rows = _undistortion_maps(self)
         return cv2.remap(
             image,
-            self.undistortion_map,
-            np.empty(0, np.float32),  # the map holds both coordinates; the stubs allow no None here
+            columns,
+            rows,
             cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=(float(outside),) * 4,
         )
-
-    @property
-    def undistortion_map(self) -> Float[np.ndarray, "h w 2"]:
-        """(h w 2): for every pixel of `pinhole()` the pixel of this camera that it comes from; -1e6: from
-        nowhere."""
-        return _undistortion_map(self)
 
     def with_world_scaled(self, factor: float) -> Camera:
         """The same camera in a world whose coordinates are multiplied by `factor` (millimetres to metres:
@@ -273,17 +268,20 @@ def _fold_radius(distortion_bytes: bytes) -> float:
 
 
 @lru_cache(maxsize=16)
-def _undistortion_map(camera: Camera) -> Float[np.ndarray, "h w 2"]:
-    """Cached for the cameras in use: a map costs 8 bytes a pixel and is the same in every frame."""
+def _undistortion_maps(camera: Camera) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+    """For every pixel of `pinhole()`, column and row (h w each) of the pixel it comes from; -1e6: from nowhere.
+
+    Cached for the cameras in use: maps cost 8 bytes a pixel and are the same in every frame.
+    """
     width, height = camera.size
-    source = np.empty((height, width, 2), np.float32)
+    source = np.empty((2, height, width), np.float32)
     columns = np.arange(width, dtype=np.float64)
-    for row in range(
-        0, height, 256
-    ):  # in strips: float64 intermediates of a whole 4 MP picture would take 300 MB
+    # In strips: the float64 intermediates of a whole 4 MP picture would take 300 MB.
+    for row in range(0, height, 256):
         rows = np.arange(row, min(row + 256, height), dtype=np.float64)
         pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
-        source[row : row + len(rows)] = camera.distort(pixels.reshape(-1, 2)).reshape(pixels.shape)
+        bent = camera.distort(pixels.reshape(-1, 2)).reshape(pixels.shape)
+        source[:, row : row + len(rows)] = np.moveaxis(bent, -1, 0)
     np.nan_to_num(source, copy=False, nan=-1e6)
     source.setflags(write=False)
-    return source
+    return source[0], source[1]

@@ -17,6 +17,14 @@ from capture.frame_choice import choose_frames
 from capture.image_sequence import ImageSequence, choose_sequence, find_images, find_inverted
 from capture.rig import Rig
 from capture.silhouettes import FrameSource, Silhouettes
+from capture.video_sequence import (
+    BACKGROUND,
+    VideoSequence,
+    find_calibration,
+    find_videos,
+    length_notes,
+    read_plates,
+)
 from capture.world import World, settle_world
 
 __all__ = ["Recording", "RecordingError", "Silhouettes", "open_recording"]
@@ -112,8 +120,41 @@ def open_recording(
         raise RecordingError(f"{root}: no such folder")
     chosen_calibration = None if calibration is None else Path(calibration)
     if (root / "videos").is_dir():
-        raise RecordingError(f"{root}: videos are not read yet")
+        plates = None if background is None else Path(background)
+        return _open_videos(root, sequence, chosen_calibration, plates, frames, units, up)
     return _open_images(root, sequence, chosen_calibration, frames, units, up)
+
+
+def _open_videos(
+    root: Path,
+    sequence: str | None,
+    calibration_path: Path | None,
+    background: Path | None,
+    frames: str | None,
+    units: str,
+    up: str,
+) -> Recording:
+    if sequence:
+        raise RecordingError(
+            f"{root}: a folder of videos holds one sequence; leave out --sequence {sequence}"
+        )
+    videos = find_videos(root)
+    calibration_path = calibration_path or find_calibration(root)
+    calibration = read_calibration(calibration_path, {name: video.size for name, video in videos.items()})
+    plates = read_plates(background or root / BACKGROUND, videos)
+    available = tuple(range(max(video.n_frames for video in videos.values())))
+    chosen = choose_frames(available, frames)
+    world = settle_world(
+        calibration.rig,
+        None,
+        declared_unit=calibration.unit,
+        units=units,
+        up=up,
+        where=str(calibration_path),
+    )
+    delivered = calibration.rig.with_world_scaled(world.metres_per_unit)
+    notes = [*calibration.notes, *length_notes(videos)]
+    return _recording("", calibration, world, chosen, notes, VideoSequence(videos, plates, delivered, chosen))
 
 
 def _open_images(

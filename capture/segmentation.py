@@ -21,7 +21,7 @@ import scipy.sparse
 from jaxtyping import Bool, Float, UInt8
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
-from capture.background import departure
+from capture.colour_difference import departure
 
 _SURE_LEVELS = 28
 _NOISE_LEVELS = 4.0
@@ -62,7 +62,7 @@ def segment(
         cv2.resize(image[box], size, interpolation=cv2.INTER_AREA).astype(np.uint8)
         for image in (picture, background)
     )
-    person = _segment_small(small, small_background, small_outline, small_known)
+    person = segment_small(small, small_background, small_outline, small_known)
     if not person.any():
         return full
     rough = cv2.resize(person.astype(np.float32), (columns[-1] + 1 - columns[0], rows[-1] + 1 - rows[0]))
@@ -71,7 +71,9 @@ def segment(
     return full
 
 
-def _segment_small(picture: Picture, background: Picture, outline: Mask, known: Mask) -> Mask:
+def segment_small(picture: Picture, background: Picture, outline: Mask, known: Mask) -> Mask:
+    """The person (h w) in one picture by probabilities and minimum cut, without the refinement at full
+    size."""
     differs = departure(picture, background) > _SURE_LEVELS
     solid = (
         cv2.morphologyEx(
@@ -102,14 +104,17 @@ def _background_density(picture: Picture, background: Picture) -> Float[np.ndarr
 
 
 def _range_density(picture: Picture, background: Picture) -> Float[np.ndarray, "h w"]:
-    """Density of a colour drawn evenly from the background's range over 3x3 pixels, plus noise, per channel.
+    """Density of a colour drawn evenly from the background's range up to half a pixel around, plus noise,
+    per channel.
 
-    A busy background (stripes) spreads its probability over a wide range, so it explains any one colour
-    poorly.
+    The range forgives a small shift between plate and video. A busy background (stripes) spreads its
+    probability over a wide range, so it explains any one colour poorly.
     """
     kernel = np.ones((3, 3), np.uint8)
-    high = cv2.dilate(background, kernel).astype(np.float32)
-    low = cv2.erode(background, kernel).astype(np.float32)
+    middle = background.astype(np.float32)
+    # Half-way to the neighbours' extremes: where linear interpolation arrives half a pixel away.
+    high = (cv2.dilate(background, kernel) + middle) / 2
+    low = (cv2.erode(background, kernel) + middle) / 2
     value = picture.astype(np.float32)
     off = np.maximum(np.maximum(value - high, low - value), 0) / _NOISE_LEVELS
     width = high - low + np.sqrt(2 * np.pi).astype(np.float32) * _NOISE_LEVELS

@@ -17,6 +17,7 @@ import numpy as np
 import scipy.ndimage
 from jaxtyping import Bool, Int, UInt8
 
+from capture.colour_difference import scaled_size
 from capture.rig import Rig
 from capture.world import closest_point
 
@@ -100,11 +101,6 @@ class RegionFinder:
         hit = self.pixels[camera_idx][voxels & self.visible[camera_idx]]
         image[hit[:, 1], hit[:, 0]] = 1
         return cv2.dilate(image, _disc(widen * max(width, height) / 80)) > 0
-
-
-def scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:
-    """(width, height) px of a picture scaled by `scale`."""
-    return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
 def _disc(radius_px: float) -> UInt8[np.ndarray, "k k"]:

@@ -58,7 +58,7 @@ def settle_world(
     if masks is not None and miss > 0.08 * distance:
         notes.append(
             "The rays through the silhouettes' middles miss each other by "
-            f"{100 * miss / distance:.0f} % of the distance: check that folders and calibration files belong together."
+            f"{100 * miss / distance:.0f} % of the distance: do folders and calibration files belong together?"
         )
     unit = _settle_unit(rig, masks, subject, declared_unit, units, where, notes)
     return World(unit, METRES_PER_UNIT[unit], _settle_up(rig, up, notes), tuple(notes))
@@ -146,8 +146,8 @@ def _check_facing(
     if len(behind) == len(rig) and any(camera.projection is not None for camera in rig):
         raise RecordingError(
             f"{where}: mirrored calibration: with the sign fixed so that the subject is in front, "
-            f"cameras {names} are left-handed. Negate one world axis (one of columns 1 to 3 of each matrix), or, where "
-            "rows count from the bottom, replace row 2 by (height - 1) x row 3 - row 2"
+            f"cameras {names} are left-handed. Negate one world axis (one of columns 1 to 3 of each matrix), "
+            "or, where rows count from the bottom, replace row 2 by (height - 1) x row 3 - row 2"
         )
     kind = (
         "mirrored or inverted"
