@@ -269,7 +269,8 @@ def _fold_radius(distortion_bytes: bytes) -> float:
 
 @lru_cache(maxsize=16)
 def _undistortion_maps(camera: Camera) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-    """For every pixel of `pinhole()`, column and row (h w each) of the pixel it comes from; -1e6: from nowhere.
+    """For every pixel of `pinhole()`, column and row (h w each) of the pixel it comes from; -1e6: from
+    nowhere.
 
     Cached for the cameras in use: maps cost 8 bytes a pixel and are the same in every frame.
     """
