@@ -30,8 +30,8 @@ SPILLED_RGB = (86, 132, 240)
 def overlay(
     camera: Camera,
     surfaces: Sequence[Surface],
-    picture: UInt8[np.ndarray, "h w 3"] | None,
-    silhouette: UInt8[np.ndarray, "h w"] | None = None,
+    picture: UInt8[np.ndarray, "_ _ 3"] | None,
+    silhouette: UInt8[np.ndarray, "_ _"] | None = None,
     *,
     strength: float = 0.62,
 ) -> UInt8[np.ndarray, "h w 3"]:
@@ -90,7 +90,7 @@ def agreement_picture(
 def overlay_frames(
     camera: Camera,
     views: Iterable[
-        tuple[Sequence[Surface], UInt8[np.ndarray, "h w 3"] | None, UInt8[np.ndarray, "h w"] | None]
+        tuple[Sequence[Surface], UInt8[np.ndarray, "_ _ 3"] | None, UInt8[np.ndarray, "_ _"] | None]
     ],
     *,
     longest_px: int = 1280,
@@ -156,8 +156,8 @@ def intersection_over_union(mask: Bool[np.ndarray, "h w"], silhouette: UInt8[np.
 
 def _background(
     camera: Camera,
-    picture: UInt8[np.ndarray, "h w 3"] | None,
-    silhouette: UInt8[np.ndarray, "h w"] | None,
+    picture: UInt8[np.ndarray, "_ _ 3"] | None,
+    silhouette: UInt8[np.ndarray, "_ _"] | None,
 ) -> UInt8[np.ndarray, "h w 3"]:
     width, height = camera.size
     for name, image in (("picture", picture), ("silhouette", silhouette)):
@@ -187,4 +187,4 @@ def body_surface(
     vertices: Float[np.ndarray, "v 3"], faces: np.ndarray, colour: tuple[int, int, int] = BODY_RGB
 ) -> Surface:
     """A fitted body ready to be drawn over pictures."""
-    return Surface(vertices, faces, None, colour, roughness=0.7)
+    return Surface(vertices, faces, None, colour, roughness=0.7, two_sided=False)

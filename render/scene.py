@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,7 +31,8 @@ class Surface:
     """A triangle mesh with its look.
 
     vertices: metres, world frame. colours: RGB a vertex, or None for `colour` everywhere. roughness: 0
-    mirror, 1 chalk.
+    mirror, 1 chalk. two_sided: may be seen from behind; one that is closed and faces outwards draws faster
+    without.
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -39,6 +40,7 @@ class Surface:
     colours: UInt8[np.ndarray, "v 3"] | None = None
     colour: tuple[int, int, int] = (196, 164, 142)
     roughness: float = 0.8
+    two_sided: bool = True
 
 
 @dataclass(frozen=True)
@@ -158,6 +160,9 @@ class Stage:
         self._points = self._points - self._middle
         self._scene = pyrender.Scene(bg_color=(0.0, 0.0, 0.0, 0.0), ambient_light=(ambient,) * 3)
         self._nodes = [self._scene.add(self._mesh(pyrender, s)) for s in drawn]
+        # pyrender draws no back faces in its mask pass, whatever the material says: it gets them turned round
+        turned = [replace(s, faces=s.faces[:, ::-1]) for s in drawn if s.two_sided]
+        self._backs = [self._scene.add(self._mesh(pyrender, s)) for s in turned]
         self._lights: list[Any] = []
         self._eye: Any = None
         self._window = (0, 0, 1, 1)
@@ -168,7 +173,7 @@ class Stage:
             baseColorFactor=(*factor, 1.0),
             metallicFactor=0.0,
             roughnessFactor=surface.roughness,
-            doubleSided=True,
+            doubleSided=surface.two_sided,
         )
         colours = None
         if surface.colours is not None:
@@ -199,6 +204,8 @@ class Stage:
             )
             for light in (lights_of_camera(camera) if lights is None else lights)
         ]
+        for node in self._backs:
+            node.mesh.is_visible = False
         flags = pyrender.RenderFlags.RGBA
         if not self._lights:
             flags |= pyrender.RenderFlags.FLAT
@@ -217,8 +224,10 @@ class Stage:
         self._place(camera)
         offscreen = _offscreen()
         offscreen.viewport_width, offscreen.viewport_height = self._window[2:]
-        flags = pyrender.RenderFlags.SEG | pyrender.RenderFlags.SKIP_CULL_FACES
-        _, depth = offscreen.render(self._scene, flags, dict.fromkeys(self._nodes, 255))
+        for node in self._backs:
+            node.mesh.is_visible = True
+        nodes = dict.fromkeys(self._nodes + self._backs, 255)
+        _, depth = offscreen.render(self._scene, pyrender.RenderFlags.SEG, nodes)
         return self._pasted(depth, camera)
 
     def _pasted(self, part: np.ndarray, camera: Camera) -> np.ndarray:

@@ -71,12 +71,12 @@ class Subject:
         """The posed body and what it wears, ready to be drawn. Arguments as `garments.drape`; any upright
         frame.
         """
-        surfaces = [Surface(posed, self.body.faces, self.skin_colours, roughness=0.65)]
+        surfaces = [Surface(posed, self.body.faces, self.skin_colours, two_sided=False)]
         covered = np.zeros(len(posed))
         for garment in self.garments:
             vertices, covered = drape(garment, posed, self.body.faces, velocity, up, moment, covered)
             colours = np.concatenate([garment.colours, garment.colours[garment.rim]])
-            surfaces.append(Surface(vertices, garment.faces, colours, roughness=0.9))
+            surfaces.append(Surface(vertices, garment.faces, colours, two_sided=False))
         return surfaces
 
 

@@ -13,8 +13,8 @@ from tqdm import tqdm
 
 def write_video(
     path: Path | str,
-    frames: Iterable[UInt8[np.ndarray, "h w 3"]],
-    fps: float = 25.0,
+    frames: Iterable[np.ndarray],
+    fps: float | int = 25,
     *,
     quality: int = 20,
     progress: str | None = None,
