@@ -1,4 +1,5 @@
-"""The one place where JAX is configured: double precision and a compilation cache that outlives the process."""
+"""The one place where JAX is configured: double precision and a compilation cache that outlives the process.
+"""
 
 from functools import cache
 from pathlib import Path
@@ -6,7 +7,8 @@ from pathlib import Path
 
 @cache
 def setup_jax() -> Path | None:
-    """Enable float64 and the persistent compilation cache; returns its folder (None where it cannot be written).
+    """Enable float64 and the persistent compilation cache; returns its folder (None where it cannot be
+    written).
 
     Call before the first JAX array is made; further calls do nothing. Never called at import.
     """

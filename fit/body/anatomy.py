@@ -1,7 +1,8 @@
 """From one person's measurements to the left half of the body as an implicit surface, and to the 24 joints.
 
-Frame while building: floor y = 0, +z front, +x the body's left, T-pose, palms down, metres. Trunk and limbs are
-lofts, muscles and fat ellipsoids and cones, all joined by a smooth union whose radius is chosen part by part.
+Frame while building: floor y = 0, +z front, +x the body's left, T-pose, palms down, metres. Trunk and limbs
+are lofts, muscles and fat ellipsoids and cones, all joined by a smooth union whose radius is chosen part by
+part.
 """
 
 from collections.abc import Callable
@@ -144,23 +145,23 @@ def add_neck_and_head(body: ImplicitBody, b: Build) -> None:
         rows.append((fraction, 0, 0, half, half, front * length, back * length, n, n))
         along.append(chin + fraction * height)
     crown_cap = (0.014, 0.30 * height)  # one tall cap instead of rows up to the crown, which would flatten it
-    body.add(
-        Loft((0, 0, ear_z), (0, 1, 0), (1, 0, 0), (0, 0, 1), rows, along, 0.022, crown_cap, blur=0.012)
-    )
+    body.add(Loft((0, 0, ear_z), (0, 1, 0), (1, 0, 0), (0, 0, 1), rows, along, 0.022, crown_cap, blur=0.012))
 
     size = height / 0.225
 
     def at(x: float, fraction: float, z: float) -> Vector:
         return np.array([x * breadth, chin + fraction * height, ear_z + z * length])
 
-    def lump(x: float, fraction: float, z: float, radii: tuple[float, float, float], blend_m: float) -> Ellipsoid:
+    def lump(
+        x: float, fraction: float, z: float, radii: tuple[float, float, float], blend_m: float
+    ) -> Ellipsoid:
         return Ellipsoid(at(x, fraction, z), np.array(radii) * size, blend_m)
 
-    body.add(Cone(at(0, 0.50, 0.089), at(0, 0.340, 0.107), 0.0065 * size, 0.0095 * size, 0.014))  # nose
+    body.add(Cone(at(0.0, 0.50, 0.089), at(0.0, 0.340, 0.107), 0.0065 * size, 0.0095 * size, 0.014))  # nose
     body.add(lump(0.011, 0.315, 0.098, (0.009, 0.008, 0.010), 0.008))  # nostril wing
-    body.add(lump(0, 0.205, 0.089, (0.023, 0.0070, 0.009), 0.010))  # upper lip
-    body.add(lump(0, 0.165, 0.087, (0.019, 0.0070, 0.009), 0.010))  # lower lip
-    body.add(lump(0, 0.045, 0.080, (0.019, 0.016, 0.014), 0.018))  # chin
+    body.add(lump(0.0, 0.205, 0.089, (0.023, 0.0070, 0.009), 0.010))  # upper lip
+    body.add(lump(0.0, 0.165, 0.087, (0.019, 0.0070, 0.009), 0.010))  # lower lip
+    body.add(lump(0.0, 0.045, 0.080, (0.019, 0.016, 0.014), 0.018))  # chin
     body.add(lump(0.042, 0.365, 0.062, (0.019, 0.019, 0.019), 0.035))  # cheek
     body.add(lump(0.028, 0.57, 0.084, (0.024, 0.009, 0.012), 0.016))  # brow
     body.cut(lump(0.032, 0.490, 0.101, (0.017, 0.010, 0.016), 0.012))  # eye socket
@@ -177,22 +178,20 @@ def add_shoulder_girdle(body: ImplicitBody, b: Build) -> None:
     arm = m.biceps / 0.312
     trapezius = 0.031 * (m.neck / 0.364) * brawn**0.25
     neck_side = (0.016, y(0.850), -0.036)
-    acromion = shoulder + [-0.030, 0.028 * scale, -0.012]
+    acromion = shoulder + np.array([-0.030, 0.028 * scale, -0.012])
     body.add(Cone(neck_side, acromion, trapezius, 0.026 * arm**0.5, 0.055))
-    clavicle_end = shoulder + [-0.020, 0.020 * scale, 0.005]
+    clavicle_end = shoulder + np.array([-0.020, 0.020 * scale, 0.005])
     body.add(Cone((0.020, y(0.818), 0.012), clavicle_end, 0.018, 0.024, 0.045))
     pectoral = np.array([0.084, 0.060, 0.046]) * (0.90 + 0.10 * brawn) * chest_mid**0.8
     body.add(Ellipsoid((0.52 * shoulder[0], y(0.752), 0.064 * chest), pectoral, 0.06))
     # Latissimus behind and the front fold: between them they make the armpit.
     lat_low = (0.108 * chest, y(0.715), -0.040)
     lat_radii = 0.034 * brawn**0.3 * chest_mid, 0.043 * chest_mid
-    body.add(Cone(shoulder + [-0.010, -0.024, -0.034], lat_low, *lat_radii, 0.05))
+    body.add(Cone(shoulder + np.array([-0.010, -0.024, -0.034]), lat_low, *lat_radii, 0.05))
     fold_low = (0.090 * chest, y(0.752), 0.050)
     fold_radii = 0.032 * brawn**0.2 * chest_mid, 0.039 * chest_mid
-    body.add(Cone(shoulder + [0.0, -0.016, 0.014], fold_low, *fold_radii, 0.045))
-    body.add(
-        Ellipsoid((0.085, y(0.765), -0.090 * chest), np.array([0.060, 0.075, 0.040]) * chest_mid, 0.05)
-    )
+    body.add(Cone(shoulder + np.array([0.0, -0.016, 0.014]), fold_low, *fold_radii, 0.045))
+    body.add(Ellipsoid((0.085, y(0.765), -0.090 * chest), np.array([0.060, 0.075, 0.040]) * chest_mid, 0.05))
 
 
 def add_breast(body: ImplicitBody, b: Build) -> None:
@@ -220,7 +219,7 @@ def add_arm(body: ImplicitBody, b: Build) -> None:
     body.add(Loft(shoulder, axis, (0, 1, 0), (0, 0, 1), rows, along, 0.045, (0.03, 0.015)))
     q = b.ratio_mid["biceps"]
     deltoid = np.array([0.075, 0.050 * q, 0.058 * q]) * m.muscle**0.12
-    body.add(Ellipsoid(shoulder + [0.030 * b.scale, 0.006, 0], deltoid, 0.035))
+    body.add(Ellipsoid(shoulder + np.array([0.030 * b.scale, 0.006, 0]), deltoid, 0.035))
 
 
 def add_hand(body: ImplicitBody, b: Build) -> None:
@@ -232,7 +231,7 @@ def add_hand(body: ImplicitBody, b: Build) -> None:
     along = [f * length for f, *_ in PALM]
     body.add(Loft(wrist, (1, 0, 0), (0, 1, 0), (0, 0, 1), rows, along, 0.02, (0.02, 0.009), blur=0.015))
     for _, sideways, knuckle, tip, radius_a, radius_b, spread_deg in FINGERS:
-        base = wrist + [knuckle * length, 0, sideways * width]
+        base = wrist + np.array([knuckle * length, 0, sideways * width])
         reach = (tip - knuckle) * length - radius_b * width
         spread = np.radians(spread_deg)
         first = unit([np.cos(spread), -0.10, np.sin(spread)])  # a relaxed hand: fingers bend a little
@@ -244,7 +243,7 @@ def add_hand(body: ImplicitBody, b: Build) -> None:
             Cone(middle, middle + second * reach * 0.50, radius_mid, radius_b * width, 0.004, carries=True)
         )
     thumb = [
-        wrist + [along_m * length, down, side * width]
+        wrist + np.array([along_m * length, down, side * width])
         for along_m, down, side in (
             (0.10, -0.006, 0.020),
             (0.33, -0.016, 0.051),
@@ -286,7 +285,9 @@ def add_leg(body: ImplicitBody, b: Build) -> None:
     belly_of_calf = hip + down * (b.thigh_m + 0.30 * b.shank_m) / length + [-0.014, 0, -0.030]
     body.add(Ellipsoid(belly_of_calf, np.array([0.036, 0.085, 0.036]) * calf, 0.04))
     q = b.ratio_mid["knee"]
-    body.add(Ellipsoid(knee + [0, 0.008, 0.034 * q], np.array([0.026, 0.032, 0.020]) * q, 0.025))  # patella
+    body.add(
+        Ellipsoid(knee + np.array([0, 0.008, 0.034 * q]), np.array([0.026, 0.032, 0.020]) * q, 0.025)
+    )  # patella
     for outer in ((0.028, -0.004, -0.006), (-0.028, 0.006, 0.004)):  # malleoli
         body.add(Ellipsoid(ankle + outer, (0.010, 0.014, 0.012), 0.018))
 
@@ -319,7 +320,8 @@ def add_foot(body: ImplicitBody, b: Build) -> None:
 def read_by_tape(m: Measurements) -> Measurements:
     """The girths to model so that a tape around the finished mesh reads the ones asked for.
 
-    Smooth unions add a little more to thin bodies than to heavy ones; `stations.TAPE_CORRECTION` holds how much.
+    Smooth unions add a little more to thin bodies than to heavy ones; `stations.TAPE_CORRECTION` holds how
+    much.
     """
     average = survey_mean(m.sex)
     modelled = {}

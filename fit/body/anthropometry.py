@@ -2,12 +2,12 @@
 
 The statistics are those of ANSUR II, the 2012 survey of U.S. Army personnel (Gordon et al. 2014,
 NATICK/TR-15/007, public release; 4082 men, 1986 women), reduced to the measures needed here and kept in
-`ansur2.json`. Each sex is one Gaussian in the logarithms of its measures: girths and lengths multiply, never turn
-negative, and the body-mass index is a plain linear function (log weight - 2 log stature).
+`ansur2.json`. Each sex is one Gaussian in the logarithms of its measures: girths and lengths multiply, never
+turn negative, and the body-mass index is a plain linear function (log weight - 2 log stature).
 
 Soldiers are heavier-muscled and span less body mass than the public, so the BMI is replaced by a civilian one
-(CIVILIAN_BMI, from 16 to 45) and every other measure follows along its regression on the BMI; what is left of a
-measure at a given BMI keeps its measured covariance. Two measures the survey lacks (breast size, muscle
+(CIVILIAN_BMI, from 16 to 45) and every other measure follows along its regression on the BMI; what is left of
+a measure at a given BMI keeps its measured covariance. Two measures the survey lacks (breast size, muscle
 definition beyond girths) are free factors.
 """
 
@@ -22,7 +22,8 @@ from jaxtyping import Float
 BMI_RANGE = (16.0, 45.0)
 """kg/m2: nobody is drawn outside it."""
 CIVILIAN_BMI = {"female": (24.3, 0.205), "male": (25.8, 0.175)}
-"""Median (kg/m2) and standard deviation of the logarithm. A mix of national adult surveys, not one country's."""
+"""Median (kg/m2) and standard deviation of the logarithm. A mix of national adult surveys, not one country's.
+"""
 MAX_SCORE = 2.5
 """Scores are clipped here: beyond it the primitives of the anatomy begin to interpenetrate."""
 FREE_FACTORS = ("bust", "definition")
@@ -114,7 +115,8 @@ def load_statistics(sex_name: str) -> SexStatistics:
     own = table[sex_name]
     mean, sd = np.array(own["mean"]), np.array(own["sd"])
     variation = sd / mean
-    # A log-normal variable of this mean and coefficient of variation; correlations hardly change for CV < 0.2.
+    # A log-normal variable of this mean and coefficient of variation; correlations hardly change for CV <
+    # 0.2.
     log_sd = np.sqrt(np.log1p(variation**2))
     covariance = np.array(own["correlation"]) * np.outer(log_sd, log_sd)
     covariance += 1e-9 * np.eye(len(mean))  # the table is rounded to four decimals
@@ -148,8 +150,8 @@ def measure(
 ) -> Measurements:
     """The person of these independent standard-normal scores (all zero: the average one of this `sex`).
 
-    Between the sexes the means and the square roots of the covariances are mixed. `bmi`, when given, replaces the
-    drawn body-mass index, and the other measures follow their regression on it.
+    Between the sexes the means and the square roots of the covariances are mixed. `bmi`, when given, replaces
+    the drawn body-mass index, and the other measures follow their regression on it.
     """
     z = np.zeros(n_scores()) if scores is None else np.asarray(scores, dtype=np.float64)
     female, male = load_statistics("female"), load_statistics("male")
@@ -177,7 +179,9 @@ def measure(
     stature_axis = np.zeros(n_measures)
     stature_axis[female.measures.index("stature")] = 1.0
     readings = np.stack([stature_axis, functional])
-    expected = covariance @ readings.T @ np.linalg.solve(readings @ covariance @ readings.T, readings @ deviation)
+    expected = (
+        covariance @ readings.T @ np.linalg.solve(readings @ covariance @ readings.T, readings @ deviation)
+    )
     residual = dict(zip(female.measures, (deviation - expected).tolist(), strict=True))
     value = dict(zip(female.measures, (np.exp(mean + deviation) / 1000.0).tolist(), strict=True))
 
@@ -229,16 +233,19 @@ def measure(
 
 @cache
 def survey_mean(sex: float) -> Measurements:
-    """The survey's average person of this sex, at the survey's own BMI: the body the station tables describe."""
+    """The survey's average person of this sex at the survey's own BMI: what the station tables describe."""
     female, male = load_statistics("female"), load_statistics("male")
     bmis = [float(np.exp(s.log_bmi @ s.mean_log + MM_BMI_OFFSET)) for s in (female, male)]
     return measure(sex, bmi=float(np.exp(mix((np.log(bmis[0]), np.log(bmis[1])), sex))))
 
 
-def draw_people(n: int, seed: int, sex: float | None) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n s"]]:
+def draw_people(
+    n: int, seed: int, sex: float | None
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n s"]]:
     """Sexes and scores of n people, in antithetic pairs (z, -z), so that the sample's mean is exact.
 
-    `sex` None alternates women and men (pairs of one of each); the coordinate is jittered a little either way.
+    `sex` None alternates women and men (pairs of one of each); the coordinate is jittered a little either
+    way.
     """
     rng = np.random.default_rng(seed)
     sexes, scores = np.empty(n + n % 2), np.empty((n + n % 2, n_scores()))

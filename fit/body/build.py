@@ -1,7 +1,8 @@
 """The free body from beginning to end, built once and kept in the user's cache.
 
-Half mesh -> people drawn and brought into correspondence -> shape space -> joint regressor, weights, correctives.
-Deterministic: the same sources give the same arrays. The three sexes share one mesh. Licence of the result: CC0.
+Half mesh -> people drawn and brought into correspondence -> shape space -> joint regressor, weights,
+correctives. Deterministic: the same sources give the same arrays. The three sexes share one mesh. Licence of
+the result: CC0.
 """
 
 import hashlib
@@ -40,9 +41,9 @@ N_PEOPLE_FOR_JOINTS = 120
 DECIMALS = 9  # of the stored arrays: a nanometre, so that a last bit of some BLAS does not change the hash
 LICENCE = "CC0-1.0"
 GENERATOR = (
-    "ansur2.json", "anatomy.py", "anthropometry.py", "build.py", "correctives.py", "correspondence.py", "half_mesh.py",
-    "implicit.py", "joint_regressor.py", "parts.py", "remesh.py", "shape_space.py", "skeleton.py", "skin_weights.py",
-    "stations.py",
+    "ansur2.json", "anatomy.py", "anthropometry.py", "build.py", "correctives.py", "correspondence.py",
+    "half_mesh.py", "implicit.py", "joint_regressor.py", "model.py", "parts.py", "remesh.py",
+    "shape_space.py", "skeleton.py", "skin_weights.py", "stations.py",
 )  # fmt: skip
 
 
@@ -62,7 +63,8 @@ def cache_folder() -> Path:
 def load_or_build(sex_name: str, *, show_progress: bool = True, folder: Path | None = None) -> BodyModel:
     """The free body of this sex from the cache; built and kept there when it is not (or no longer readable).
 
-    Two processes may build at once: each writes under a name of its own and renames, and both results are equal.
+    Two processes may build at once: each writes under a name of its own and renames, and both results are
+    equal.
     """
     folder = cache_folder() if folder is None else folder
     path = folder / f"{sex_name}.npz"
@@ -164,4 +166,6 @@ def _held(
     """Where the displacement components must vanish: hands, feet, and the head but for its neck side."""
     held = region_mask(parts, "hand", "foot").astype(np.float64)
     head = parts == JOINT["head"]
-    return np.maximum(held, head * half_mesh.smooth_step(-0.02, 0.03, template[:, 1] - joints[JOINT["head"], 1]))
+    return np.maximum(
+        held, head * half_mesh.smooth_step(-0.02, 0.03, template[:, 1] - joints[JOINT["head"], 1])
+    )

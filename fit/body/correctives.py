@@ -1,8 +1,8 @@
 """Pose correctives: what linear skinning lacks against dual quaternions, made linear in the joint rotations.
 
-For every joint, a ridge regression on (R - I) of the difference between dual-quaternion skinning (Kavan et al. 2008)
-and linear blend skinning, pulled back to the rest pose: 207 columns in SMPL's layout. Elbows and knees keep their
-volume; there is no muscle in it.
+For every joint, a ridge regression on (R - I) of the difference between dual-quaternion skinning (Kavan et
+al. 2008) and linear blend skinning, pulled back to the rest pose: 207 columns in SMPL's layout. Elbows and
+knees keep their volume; there is no muscle in it.
 """
 
 import numpy as np
@@ -56,7 +56,7 @@ def fit_pose_correctives(
         for _ in range(N_ROTATIONS):
             axis = rng.standard_normal(3)
             rotations = np.tile(np.eye(3), (N_JOINTS, 1, 1))
-            rotations[j] = axis_angle_to_matrix(axis / np.linalg.norm(axis) * rng.uniform(*ANGLES_RAD))[0]
+            rotations[j] = axis_angle_to_matrix(axis / np.linalg.norm(axis) * rng.uniform(*ANGLES_RAD))
             bones = world_from_rest(rotations, joints)
             linear, blended = blend_linearly(vertices[touched], weights[touched], bones)
             wanted = blend_dual_quaternions(vertices[touched], weights[touched], bones)
@@ -73,7 +73,9 @@ def fit_pose_correctives(
 def mirror_correctives(
     directions: Float[np.ndarray, "v 3 207"], partner: Int[np.ndarray, "v"]
 ) -> Float[np.ndarray, "v 3 207"]:
-    """The correctives seen in the mirror: joints swap sides, and a rotation's xy, xz, yx, zx entries change sign."""
+    """The correctives seen in the mirror: joints swap sides, and a rotation's xy, xz, yx, zx entries change
+    sign.
+    """
     flip = np.array([-1.0, 1.0, 1.0])
     per_joint = directions.reshape(len(directions), 3, N_JOINTS - 1, 3, 3)
     swapped = per_joint[partner][:, :, MIRROR[1:] - 1]

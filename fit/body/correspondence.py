@@ -1,7 +1,7 @@
 """Dense correspondence: the template's vertices carried onto any other person of the family.
 
-Every vertex keeps its coordinates in the lofts, fingers and toes near it; another body decodes them with its own
-tables, and a few Newton steps bring the result onto that body's skin.
+Every vertex keeps its coordinates in the lofts, fingers and toes near it; another body decodes them with its
+own tables, and a few Newton steps bring the result onto that body's skin.
 """
 
 import numpy as np
@@ -41,7 +41,7 @@ class Carrier:
         weight /= weight.sum(0)
         self.index = [np.flatnonzero(w > 1e-4) for w in weight]
         self.weight = [w[ix, None] for w, ix in zip(weight, self.index, strict=True)]
-        self.code = [p.encode(half[ix]) for p, ix in zip(carriers, self.index, strict=True)]  # type: ignore[union-attr]
+        self.code = [p.encode(half[ix]) for p, ix in zip(carriers, self.index, strict=True)]
         # Which vertices each primitive shapes is the same in every body: decided once, on the template.
         self.reached = [np.flatnonzero(p.distance(half) < 0.03 + p.blend_m) for p in source.primitives]
         self.smooth = neighbour_mean(faces, self.n)

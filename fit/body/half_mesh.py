@@ -1,6 +1,7 @@
 """The template: a half mesh of the average body, exactly 6890 vertices once mirrored.
 
-Marching cubes on a grid graded in x, y and z, then remeshing to a size field that is fine at hands, feet and face.
+Marching cubes on a grid graded in x, y and z, then remeshing to a size field that is fine at hands, feet and
+face.
 """
 
 from collections.abc import Callable, Iterable
@@ -90,7 +91,7 @@ def wanted_edge(
 
 
 def settle_count(mesh: Remesher, target: int) -> None:
-    """Single collapses and splits until the mirrored count is met: a seam edge moves it by 1, another by 2."""
+    """Single collapses and splits until the mirrored count is met (a seam edge: 1 vertex, another: 2)."""
     for _ in range(400):
         n = mesh.n_mirrored()
         if n == target:
@@ -110,7 +111,9 @@ def settle_count(mesh: Remesher, target: int) -> None:
 def make_half_mesh(
     progress: Callable[[], object] = lambda: None,
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """Half mesh of the average body (sex 0.5, civilian BMI), floor frame; `progress` is called N_ROUNDS times."""
+    """Half mesh of the average body (sex 0.5, civilian BMI), floor frame; `progress` is called N_ROUNDS
+    times.
+    """
     person = measure(0.5)
     body, joints = make_person(person)
     stature, shoulder_y, wrist_x = (
@@ -119,7 +122,9 @@ def make_half_mesh(
         joints[JOINT["left_wrist"], 0],
     )
     axes = (
-        graded_axis([(0, 0.16, 0.008), (0.16, wrist_x - 0.02, 0.011), (wrist_x - 0.02, wrist_x + 0.24, 0.0032)]),
+        graded_axis(
+            [(0.0, 0.16, 0.008), (0.16, wrist_x - 0.02, 0.011), (wrist_x - 0.02, wrist_x + 0.24, 0.0032)]
+        ),
         graded_axis(
             [
                 (-0.012, 0.03, 0.004),

@@ -1,23 +1,26 @@
 """Implicit-surface primitives of the body's generator, and their smooth union.
 
-Lofted tubes, ellipsoids and rounded cones. Each gives a pseudo-distance (metres, negative inside, exact along the
-local radius). Lofts and cones that carry skin also give `encode` and `decode`, a pair of maps between space and
-coordinates relative to the primitive: that pair takes a vertex from one body to the same place on another.
+Lofted tubes, ellipsoids and rounded cones. Each gives a pseudo-distance (metres, negative inside, exact along
+the local radius). Lofts and cones that carry skin also give `encode` and `decode`, a pair of maps between
+space and coordinates relative to the primitive: that pair takes a vertex from one body to the same place on
+another.
 """
 
-from typing import Protocol
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 
 PROFILE_SAMPLES = 192  # of a loft's section table along its axis
 TINY = 1e-9
 
+VectorLike = np.ndarray | Sequence[Any]
 
-def unit(vector: ArrayLike) -> Float[np.ndarray, "3"]:
+
+def unit(vector: VectorLike) -> Float[np.ndarray, "3"]:
     v = np.asarray(vector, dtype=np.float64)
     return v / np.linalg.norm(v)
 
@@ -34,21 +37,22 @@ class Primitive(Protocol):
 class Loft:
     """A tube along a straight axis with superelliptic sections that differ by quadrant.
 
-    `rows`: (station, centre1, centre2, radius1+, radius1-, radius2+, radius2-, exponent2+, exponent2-), one per
-    table row; `along_m`: the axial position of each row. The station is an anatomical number, equal in all
-    bodies (a leg: 0 hip, 1 knee, 2 ankle). Sections between rows are interpolated monotonically, then blurred.
+    `rows`: (station, centre1, centre2, radius1+, radius1-, radius2+, radius2-, exponent2+, exponent2-), one
+    per table row; `along_m`: the axial position of each row. The station is an anatomical number, equal in
+    all bodies (a leg: 0 hip, 1 knee, 2 ankle). Sections between rows are interpolated monotonically, then
+    blurred.
     """
 
     carries = True
 
     def __init__(
         self,
-        origin: ArrayLike,
-        axis: ArrayLike,
-        first: ArrayLike,
-        second: ArrayLike,
-        rows: ArrayLike,
-        along_m: ArrayLike,
+        origin: VectorLike,
+        axis: VectorLike,
+        first: VectorLike,
+        second: VectorLike,
+        rows: VectorLike,
+        along_m: VectorLike,
         blend_m: float,
         caps_m: tuple[float, float],
         blur: float = 0.025,
@@ -117,7 +121,7 @@ class Ellipsoid:
     carries = False
 
     def __init__(
-        self, centre: ArrayLike, radii: ArrayLike, blend_m: float, axes: np.ndarray | None = None
+        self, centre: VectorLike, radii: VectorLike, blend_m: float, axes: np.ndarray | None = None
     ) -> None:
         self.centre, self.radii = np.asarray(centre, dtype=np.float64), np.asarray(radii, dtype=np.float64)
         self.blend_m = blend_m
@@ -136,8 +140,8 @@ class Cone:
 
     def __init__(
         self,
-        a: ArrayLike,
-        b: ArrayLike,
+        a: VectorLike,
+        b: VectorLike,
         radius_a: float,
         radius_b: float,
         blend_m: float,
@@ -170,7 +174,9 @@ class Cone:
 
     def decode(self, code: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3"]:
         radius = self.radius_a + (self.radius_b - self.radius_a) * code[:, 0]
-        q = np.stack([code[:, 1] * radius, code[:, 2] * radius, code[:, 0] * self.length + code[:, 3] * radius], 1)
+        q = np.stack(
+            [code[:, 1] * radius, code[:, 2] * radius, code[:, 0] * self.length + code[:, 3] * radius], 1
+        )
         return self.a + q @ self.frame
 
 
@@ -183,7 +189,7 @@ def smooth_minimum(
 
 
 class ImplicitBody:
-    """An ordered smooth union (and smooth subtraction) of primitives; zero on the skin of the left half, x >= 0."""
+    """An ordered smooth union (and subtraction) of primitives: zero on the skin of the left half, x >= 0."""
 
     FAR_M = 0.10  # value where no primitive reaches
     REACH_M = 0.05  # beyond its box and blend radius a primitive is not asked
@@ -202,16 +208,16 @@ class ImplicitBody:
 
     @staticmethod
     def join(
-        so_far: Float[np.ndarray, "n"],
-        distance: Float[np.ndarray, "n"],
+        so_far: Float[np.ndarray, "..."],
+        distance: Float[np.ndarray, "..."],
         primitive: Loft | Ellipsoid | Cone,
         is_cut: bool,
-    ) -> Float[np.ndarray, "n"]:
+    ) -> Float[np.ndarray, "..."]:
         if is_cut:
             return -smooth_minimum(-so_far, distance, primitive.blend_m)
         return smooth_minimum(so_far, distance, primitive.blend_m)
 
-    def reached(self, points: Float[np.ndarray, "n 3"]) -> list[Int[np.ndarray, "k"]]:
+    def reached(self, points: Float[np.ndarray, "n 3"]) -> list[Int[np.ndarray, "_"]]:
         """Per primitive, the indices of the points that it can touch."""
         out = []
         for primitive in self.primitives:
@@ -221,7 +227,7 @@ class ImplicitBody:
         return out
 
     def __call__(
-        self, points: Float[np.ndarray, "n 3"], reached: list[Int[np.ndarray, "k"]] | None = None
+        self, points: Float[np.ndarray, "n 3"], reached: list[Int[np.ndarray, "_"]] | None = None
     ) -> Float[np.ndarray, "n"]:
         value = np.full(len(points), self.FAR_M)
         reached = self.reached(points) if reached is None else reached
@@ -231,7 +237,7 @@ class ImplicitBody:
         return value
 
     def gradient(
-        self, points: Float[np.ndarray, "n 3"], reached: list[Int[np.ndarray, "k"]], step_m: float = 4e-4
+        self, points: Float[np.ndarray, "n 3"], reached: list[Int[np.ndarray, "_"]], step_m: float = 4e-4
     ) -> Float[np.ndarray, "n 3"]:
         """By central differences."""
         g = np.empty_like(points)

@@ -1,4 +1,6 @@
-"""The joint regressor: every joint as a sparse convex combination of vertices (Loper et al., SMPL, section 4.2)."""
+"""The joint regressor: every joint as a sparse convex combination of vertices (Loper et al., SMPL, section
+4.2).
+"""
 
 import numpy as np
 from jaxtyping import Float, Int

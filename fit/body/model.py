@@ -1,7 +1,8 @@
-"""The body model: SMPL-structured arrays (Loper et al., SIGGRAPH Asia 2015), their file, and where to get one.
+"""The body model: SMPL-structured arrays (Loper et al., SIGGRAPH Asia 2015), their file, and where to get
+one.
 
-`load_body("free:neutral")` gives the licence-free body of this package, `load_body("model.npz")` any file with
-SMPL's arrays under SMPL's key names. Plain numpy: nothing here starts JAX.
+`load_body("free:neutral")` gives the licence-free body of this package, `load_body("model.npz")` any file
+with SMPL's arrays under SMPL's key names. Plain numpy: nothing here starts JAX.
 """
 
 import hashlib
@@ -37,7 +38,9 @@ class BodyModel:
     shape_directions: Float[np.ndarray, "v 3 b"]
     """Vertex displacement of one standard deviation of each shape coefficient."""
     pose_directions: Float[np.ndarray, "v 3 p"]
-    """Rest-pose correctives by the entries of R - I, joint by joint without the root, row-major: p = 9 (J - 1)."""
+    """Rest-pose correctives by the entries of R - I, joint by joint without the root, row-major: p = 9 (J -
+    1).
+    """
     weights: Float[np.ndarray, "v j"]
     joint_regressor: Float[np.ndarray, "j v"]
     parents: Int[np.ndarray, "j"]
@@ -69,11 +72,21 @@ class BodyModel:
             found = getattr(self, key).shape
             if found != shape:
                 raise BodyModelError(
-                    f"body {self.name!r}: {key} has shape {found}, expected {shape} for {n} vertices and {j} joints."
+                    f"body {self.name!r}: {key} has shape {found}, expected {shape} "
+                    f"for {n} vertices and {j} joints."
                 )
-        for key in ("template", "shape_directions", "pose_directions", "weights", "joint_regressor", "landmarks"):
+        for key in (
+            "template",
+            "shape_directions",
+            "pose_directions",
+            "weights",
+            "joint_regressor",
+            "landmarks",
+        ):
             if not np.isfinite(getattr(self, key)).all():
                 raise BodyModelError(f"body {self.name!r}: {key} holds values that are not finite.")
+        if not len(self.faces) or not n:
+            raise BodyModelError(f"body {self.name!r}: there are {n} vertices and {len(self.faces)} faces.")
         if self.faces.min() < 0 or self.faces.max() >= n:
             raise BodyModelError(
                 f"body {self.name!r}: faces name vertices from {self.faces.min()} to {self.faces.max()}, "
@@ -81,14 +94,10 @@ class BodyModel:
             )
         if self.parents[0] != -1 or (self.parents[1:] >= np.arange(1, j)).any() or self.parents[1:].min() < 0:
             raise BodyModelError(
-                f"body {self.name!r}: the joint tree must start at the root and name parents before children; "
-                f"found parents {self.parents.tolist()}."
+                f"body {self.name!r}: the joint tree must start at the root and name parents before "
+                f"children; found parents {self.parents.tolist()}."
             )
-        if np.abs(self.weights.sum(1) - 1).max() > 1e-3:
-            raise BodyModelError(
-                f"body {self.name!r}: skinning weights of vertex {int(np.abs(self.weights.sum(1) - 1).argmax())} sum "
-                f"to {self.weights.sum(1)[np.abs(self.weights.sum(1) - 1).argmax()]:.4f} instead of 1."
-            )
+        _check_weights(f"body {self.name!r}", self.weights)
 
     @property
     def n_vertices(self) -> int:
@@ -104,7 +113,9 @@ class BodyModel:
 
     @cached_property
     def content_hash(self) -> str:
-        """SHA-256 over all arrays that shape the result (not the name): tells a run's body apart from another."""
+        """SHA-256 over all arrays that shape the result (not the name): tells a run's body apart from
+        another.
+        """
         digest = hashlib.sha256()
         for key in ("template", "faces", "shape_directions", "pose_directions", "weights", "joint_regressor"):
             array = np.ascontiguousarray(getattr(self, key))
@@ -123,7 +134,9 @@ class BodyModel:
         return replace(self, shape_directions=self.shape_directions[:, :, :n_betas], n_anthropometric=kept)
 
     def save(self, path: str | Path) -> None:
-        """Write an .npz under SMPL's key names, atomically (a temporary name in the same folder, then a rename)."""
+        """Write an .npz under SMPL's key names, atomically (a temporary name in the same folder, then a
+        rename).
+        """
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         parents = np.where(self.parents < 0, 2**32 - 1, self.parents).astype(np.uint32)  # as SMPL's files do
@@ -154,13 +167,14 @@ class BodyModel:
 
     @staticmethod
     def load(path: str | Path) -> "BodyModel":
-        """Read an .npz with SMPL's keys (Loper et al. 2015; 24 joints). Raises BodyModelError with the reason."""
+        """Read an .npz with SMPL's keys (24 joints). Raises BodyModelError with the reason."""
         path = Path(path)
         arrays = _read_arrays(path)
         missing = [key for key in SMPL_KEYS if key not in arrays]
         if missing:
+            found = ", ".join(sorted(arrays)) or "nothing"
             raise BodyModelError(
-                f"{path}: no {', '.join(missing)} in this body file (found: {', '.join(sorted(arrays)) or 'nothing'}). "
+                f"{path}: no {', '.join(missing)} in this body file (found: {found}). "
                 f"An SMPL-format .npz holds {', '.join(SMPL_KEYS)}."
             )
         dimensions = {"v_template": 2, "f": 2, "shapedirs": 3, "posedirs": 3, "weights": 2, "J_regressor": 2}
@@ -174,22 +188,27 @@ class BodyModel:
         parents[parents == 2**32 - 1] = -1  # SMPL stores the root's missing parent as the largest uint32
         if len(parents) != N_JOINTS or tuple(parents) != PARENTS:
             raise BodyModelError(
-                f"{path}: kintree_table has {len(parents)} joints{'' if len(parents) != N_JOINTS else ' in another order'}; "
+                f"{path}: kintree_table has {len(parents)} joints"
+                f"{' in another order' if len(parents) == N_JOINTS else ''}; "
                 f"bodies with SMPL's {N_JOINTS} joints are read (not SMPL-H or SMPL-X)."
             )
 
         def numbers(key: str) -> np.ndarray:
-            return np.ascontiguousarray(arrays[key], dtype=np.float64)
+            array = np.ascontiguousarray(arrays[key], dtype=np.float64)
+            if not np.isfinite(array).all():
+                raise BodyModelError(f"{path}: {key} holds values that are not finite.")
+            return array
 
         template, weights, regressor = numbers("v_template"), numbers("weights"), numbers("J_regressor")
-        for key, found, wanted in (
+        for key, shape, wanted in (
             ("weights", weights.shape, (len(template), N_JOINTS)),
             ("J_regressor", regressor.shape, (N_JOINTS, len(template))),
         ):
-            if found != wanted:
+            if shape != wanted:
                 raise BodyModelError(
-                    f"{path}: {key} has shape {found}, expected {wanted} for {len(template)} vertices."
+                    f"{path}: {key} has shape {shape}, expected {wanted} for {len(template)} vertices."
                 )
+        _check_weights(str(path), weights)
         parts = arrays["parts"].astype(np.int64) if "parts" in arrays else part_labels(weights)
         landmarks = (
             numbers("landmarks") if "landmarks" in arrays else body_25_regressor(template, parts, regressor)
@@ -210,11 +229,19 @@ class BodyModel:
         )
 
 
+def _check_weights(where: str, weights: Float[np.ndarray, "v j"]) -> None:
+    total = weights.sum(1)
+    worst = int(np.abs(total - 1).argmax())
+    if abs(total[worst] - 1) > 1e-3:
+        raise BodyModelError(f"{where}: skinning weights of vertex {worst} sum to {total[worst]:.4f}, not 1.")
+
+
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     """All arrays of an .npz, none of them a pickle (a pickle is a program)."""
     if not path.exists():
         raise BodyModelError(
-            f"{path}: no such body file. Use free:neutral, free:female, free:male, or the path of an SMPL-format .npz."
+            f"{path}: no such body file. Use free:neutral, free:female, free:male, "
+            f"or the path of an SMPL-format .npz."
         )
     if path.suffix != ".npz":
         raise BodyModelError(
@@ -245,7 +272,8 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
 def load_body(spec: str | Path, *, show_progress: bool = True) -> BodyModel:
     """The body of this specification: 'free:neutral', 'free:female', 'free:male', or the path of an .npz.
 
-    A free body is built at its first use (under a minute, with a progress bar) and then read from the user's cache.
+    A free body is built at its first use (under a minute, with a progress bar) and then read from the user's
+    cache.
     """
     text = str(spec)
     if not text.startswith("free:"):

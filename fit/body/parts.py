@@ -1,7 +1,7 @@
 """Names on the mesh: a part per vertex, coarse regions, and OpenPose's 25 points as combinations of vertices.
 
-Everything is read off the rest pose, the weights and the joint regressor, so that it works on any file of SMPL's
-structure: no vertex numbers of a particular mesh. Frame: T-pose, y up, +z front, +x the body's left.
+Everything is read off the rest pose, the weights and the joint regressor, so that it works on any file of
+SMPL's structure: no vertex numbers of a particular mesh. Frame: T-pose, y up, +z front, +x the body's left.
 """
 
 from typing import TYPE_CHECKING
@@ -24,10 +24,10 @@ REGIONS: dict[str, tuple[str, ...]] = {
     "head": ("head",),
 }
 BODY_25: tuple[str, ...] = (
-    "nose", "neck", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder", "left_elbow", "left_wrist",
-    "mid_hip", "right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle", "right_eye",
-    "left_eye", "right_ear", "left_ear", "left_big_toe", "left_small_toe", "left_heel", "right_big_toe",
-    "right_small_toe", "right_heel",
+    "nose", "neck", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder", "left_elbow",
+    "left_wrist", "mid_hip", "right_hip", "right_knee", "right_ankle", "left_hip", "left_knee",
+    "left_ankle", "right_eye", "left_eye", "right_ear", "left_ear", "left_big_toe", "left_small_toe",
+    "left_heel", "right_big_toe", "right_small_toe", "right_heel",
 )  # fmt: skip
 N_NEAREST = 6  # vertices averaged around a point of the skin: steadier under a free-form template than one
 
@@ -78,13 +78,16 @@ def _face_points(
     beside = band[np.abs(band[:, 0] - middle) > 0.85 * half_breadth]
     points = {"nose": nose}
     for side, sign in (("left", 1.0), ("right", -1.0)):
-        points[f"{side}_eye"] = nose + [sign * 0.216 * above_nose, 0.25 * above_nose, -0.20 * above_nose]
+        points[f"{side}_eye"] = nose + above_nose * np.array([sign * 0.216, 0.25, -0.20])
         points[f"{side}_ear"] = np.array([middle + sign * half_breadth, ear_level, np.median(beside[:, 2])])
     return points
 
 
 def _foot_points(
-    template: Float[np.ndarray, "v 3"], foot: Int[np.ndarray, "k"], toes: Int[np.ndarray, "k"], outwards: float
+    template: Float[np.ndarray, "v 3"],
+    foot: Int[np.ndarray, "f"],
+    toes: Int[np.ndarray, "t"],
+    outwards: float,
 ) -> dict[str, Float[np.ndarray, "3"]]:
     """Big toe, small toe and heel of one foot in the rest pose; `outwards` is +1 on the left."""
     v = template[toes]
@@ -112,9 +115,12 @@ def body_25_regressor(
 ) -> Float[np.ndarray, "25 v"]:
     """OpenPose BODY_25 points from vertices, rows summing to one.
 
-    Limb joints are the skeleton's; the neck is the middle of the shoulders and the mid-hip that of the hips, as
-    annotators place them. Face and feet come from the skin of the rest pose.
+    Limb joints are the skeleton's; the neck is the middle of the shoulders and the mid-hip that of the hips,
+    as annotators place them. Face and feet come from the skin of the rest pose.
     """
+    for name in ("head", "left_ankle", "right_ankle", "left_foot", "right_foot"):
+        if not (parts == JOINT[name]).any():
+            raise ValueError(f"no vertex follows the {name} joint, so its landmarks cannot be placed.")
     rows = {name: joint_regressor[JOINT[name]] for name in BODY_25 if name in JOINT and name != "neck"}
     rows["neck"] = 0.5 * (rows["left_shoulder"] + rows["right_shoulder"])
     rows["mid_hip"] = 0.5 * (rows["left_hip"] + rows["right_hip"])

@@ -1,16 +1,15 @@
 """What poses people take: a Gaussian over the 23 joint rotations, built from published ranges of motion.
 
-Ranges are the clinical ones (American Academy of Orthopaedic Surgeons, in Greene & Heckman 1994; Boone & Azen 1979;
-Soucie et al. 2011 for elbow, knee and ankle; White & Panjabi 1990 for the spine, shared out over the model's joints).
-Means and standard deviations are ours: a relaxed stance with hanging arms, spread so that the usual motions of a
-standing person lie within two standard deviations and the end of a range near two and a half. Knees and elbows
-bend one way only: their means lie half a bend away from straight, and samples are cut at the range.
+Ranges are the clinical ones (American Academy of Orthopaedic Surgeons, in Greene & Heckman 1994; Boone & Azen
+1979; Soucie et al. 2011 for elbow, knee and ankle; White & Panjabi 1990 for the spine, shared out over the
+model's joints). Means and standard deviations are ours: a relaxed stance with hanging arms, spread so that
+the usual motions of a standing person lie within two standard deviations and the end of a range near two and
+a half. Knees and elbows bend one way only: their means lie half a bend away from straight, and samples are
+cut at the range.
 
-Rotation vectors per joint in the T-pose's axes (x the body's left, y up, z front), radians. They are treated as
-three plain numbers: right for single-axis bends, good enough for a prior elsewhere.
+Rotation vectors per joint in the T-pose's axes (x the body's left, y up, z front), radians. They are treated
+as three plain numbers: right for single-axis bends, good enough for a prior elsewhere.
 """
-
-from __future__ import annotations
 
 import os
 import tempfile
@@ -57,7 +56,7 @@ RANGES_DEG: dict[str, tuple[_Row, _Row, _Row]] = {
 }
 
 _X, _Y, _Z = 0, 1, 2
-# Correlations between left-side (or midline) angles; each is mirrored. Sign: flexing hips go with bending knees.
+# Correlations between left-side (or midline) angles; each is mirrored.
 _COUPLINGS: tuple[tuple[str, int, str, int, float], ...] = (
     ("left_hip", _X, "left_knee", _X, -0.60),  # walking, squatting, sitting
     ("left_hip", _X, "right_hip", _X, 0.35),  # both hips in squats and chairs
@@ -69,7 +68,8 @@ _COUPLINGS: tuple[tuple[str, int, str, int, float], ...] = (
     ("left_hip", _Z, "left_ankle", _Z, -0.35),  # the sole stays flat
     ("left_hip", _X, "spine1", _X, -0.25),  # leaning into a squat
     *((a, axis, b, axis, r) for axis in (_X, _Y, _Z) for a, b, r in (
-        ("spine1", "spine2", 0.75), ("spine2", "spine3", 0.75), ("spine1", "spine3", 0.60), ("neck", "head", 0.50),
+        ("spine1", "spine2", 0.75), ("spine2", "spine3", 0.75), ("spine1", "spine3", 0.60),
+        ("neck", "head", 0.50),
     )),
     ("spine3", _Y, "neck", _Y, 0.20),
     ("spine3", _X, "neck", _X, -0.25),  # the face stays level
@@ -96,7 +96,7 @@ class PosePrior:
     high: Float[np.ndarray, "a"]
 
     @staticmethod
-    def standard() -> PosePrior:
+    def standard() -> "PosePrior":
         """The prior of this module's tables."""
         rows = np.zeros((N_JOINTS, 3, 4))
         for name, axes in RANGES_DEG.items():
@@ -118,7 +118,7 @@ class PosePrior:
 
     @cached_property
     def whitening(self) -> Float[np.ndarray, "a a"]:
-        """W such that |W (angles - mean)|2 is the squared Mahalanobis distance: the residual of a least-squares term."""
+        """W such that |W (angles - mean)|2 is the squared Mahalanobis distance: a least-squares residual."""
         return np.linalg.inv(np.linalg.cholesky(self.covariance))
 
     def sample(self, n: int, seed: int) -> Float[np.ndarray, "n a"]:
@@ -140,21 +140,29 @@ class PosePrior:
         Path(temporary).replace(path)
 
     @staticmethod
-    def load(path: str | Path) -> PosePrior:
-        """Read an .npz with mean (69,) and covariance (69, 69); low and high are optional. ValueError says what is wrong."""
+    def load(path: str | Path) -> "PosePrior":
+        """Read an .npz with mean (69,) and covariance (69, 69); low and high may be missing."""
         path = Path(path)
         try:
             with np.load(path, allow_pickle=False) as stored:
                 arrays = {key: np.asarray(stored[key], dtype=np.float64) for key in stored.files}
         except (OSError, ValueError, EOFError) as error:
-            raise ValueError(f"{path}: not a readable pose prior ({error}). Give an .npz with mean and covariance.") from error
+            raise ValueError(
+                f"{path}: not a readable pose prior ({error}). Give an .npz with mean and covariance."
+            ) from error
         for key, shape in (("mean", (N_ANGLES,)), ("covariance", (N_ANGLES, N_ANGLES))):
             if key not in arrays:
-                raise ValueError(f"{path}: no {key} in this pose prior (found: {', '.join(sorted(arrays)) or 'nothing'}).")
+                found = ", ".join(sorted(arrays)) or "nothing"
+                raise ValueError(f"{path}: no {key} in this pose prior (found: {found}).")
             if arrays[key].shape != shape:
-                raise ValueError(f"{path}: {key} has shape {arrays[key].shape}, expected {shape} (all joints but the root).")
+                raise ValueError(
+                    f"{path}: {key} has shape {arrays[key].shape}, expected {shape} "
+                    f"(all joints but the root)."
+                )
         if np.linalg.eigvalsh(arrays["covariance"]).min() <= 0:
-            raise ValueError(f"{path}: the covariance is not positive definite, so poses have no likelihood under it.")
+            raise ValueError(
+                f"{path}: the covariance is not positive definite, so poses have no likelihood under it."
+            )
         low = arrays.get("low", np.full(N_ANGLES, -np.pi))
         high = arrays.get("high", np.full(N_ANGLES, np.pi))
         return PosePrior(arrays["mean"], arrays["covariance"], low, high)
@@ -170,7 +178,7 @@ def _coupling_matrix() -> Float[np.ndarray, "a a"]:
     index = {(name, axis): 3 * (j - 1) + axis for j, name in enumerate(JOINT_NAMES) for axis in range(3)}
     correlation = np.eye(N_ANGLES)
     for a, axis_a, b, axis_b, r in _COUPLINGS:
-        # y and z mirror with a sign: a coupling of two of them keeps its sign, of one with an x axis changes it.
+        # y and z mirror with a sign: a coupling of two of them keeps it, of one with an x axis changes it.
         sign = (1 if axis_a == _X else -1) * (1 if axis_b == _X else -1)
         mirrored = (JOINT_NAMES[MIRROR[JOINT[a]]], JOINT_NAMES[MIRROR[JOINT[b]]])
         for (one, other), value in (((a, b), r), (mirrored, sign * r)):
@@ -180,7 +188,7 @@ def _coupling_matrix() -> Float[np.ndarray, "a a"]:
 
 
 def _nearest_correlation(matrix: Float[np.ndarray, "a a"]) -> Float[np.ndarray, "a a"]:
-    """A positive definite correlation matrix near one of hand-set couplings (eigenvalues lifted, diagonal restored)."""
+    """A positive definite correlation matrix near one of hand-set couplings (small eigenvalues lifted)."""
     values, vectors = np.linalg.eigh(matrix)
     lifted = (vectors * np.maximum(values, 0.05)) @ vectors.T
     scale = 1 / np.sqrt(np.diag(lifted))

@@ -1,8 +1,8 @@
 """Isotropic remeshing of the half body to a size field: split, collapse, flip, relax, project.
 
-After Botsch & Kobbelt, A Remeshing Approach to Multiresolution Modeling (SGP 2004), with a seam: vertices in the
-plane x = 0 stay there, so that mirroring gives an exactly symmetric whole. Positions are rounded to a micrometre
-each pass, so that the decisions do not hang on the last bits of a linear algebra library.
+After Botsch & Kobbelt, A Remeshing Approach to Multiresolution Modeling (SGP 2004), with a seam: vertices in
+the plane x = 0 stay there, so that mirroring gives an exactly symmetric whole. Positions are rounded to a
+micrometre each pass, so that the decisions do not hang on the last bits of a linear algebra library.
 """
 
 from collections.abc import Callable
@@ -43,7 +43,7 @@ def shape_quality(p: Point, q: Point, r: Point) -> float:
 
 
 class Remesher:
-    """A half mesh under change. `wanted(points)` is the edge length asked for; `project` returns to the skin."""
+    """A half mesh under change. `wanted(points)`: the edge length asked for; `project`: back to the skin."""
 
     def __init__(
         self,
@@ -160,7 +160,7 @@ class Remesher:
                 self.collapse(a, b)
 
     def flip_pass(self) -> None:
-        """Flip edges where that evens out valences (6 inside, 4 on the seam) or betters the worst triangle."""
+        """Flip edges where that evens out valences (6, on the seam 4) or betters the worst triangle."""
         for a, b in sorted(self.edges()):
             shared = self.around[a] & self.around[b]
             if len(shared) != 2:
@@ -197,7 +197,9 @@ class Remesher:
             self._insert((d, b, c))
 
     def relax(self, times: int, amount: float = 0.6) -> None:
-        """Move vertices along the surface to the mean of their triangles (areas in wanted units), and project."""
+        """Move vertices along the surface to the mean of their triangles (areas in wanted units), and
+        project.
+        """
         v, f = self.arrays()
         self.load(v, f)
         for _ in range(times):

@@ -1,8 +1,8 @@
 """The shape space: principal components of drawn people, then smooth bumps along the normal.
 
-Anthropometric components: area-weighted PCA (Loper et al., SMPL, section 3), scaled so that a coefficient of one is
-one standard deviation. Displacement components: low eigenmodes of the mesh's Laplacian along the normal of the mean
-body, for what no tape has measured; they fade to nothing towards hands, feet and face.
+Anthropometric components: area-weighted PCA (Loper et al., SMPL, section 3), scaled so that a coefficient of
+one is one standard deviation. Displacement components: low eigenmodes of the mesh's Laplacian along the
+normal of the mean body, for what no tape has measured; they fade to nothing towards hands, feet and face.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from .correspondence import Carrier
 from .skeleton import JOINT
 
 N_ANTHROPOMETRIC = 16
-N_DISPLACEMENT = 32
+N_DISPLACEMENT = 48
 DISPLACEMENT_SD_M = 0.0045
 """RMS over the body of the smoothest displacement component at one standard deviation."""
 ASYMMETRY = 0.4
@@ -122,17 +122,18 @@ def displacement_components(
 ) -> Float[np.ndarray, "v 3 b"]:
     """Smooth bumps along the normal at one standard deviation, most extended first.
 
-    `held` in [0, 1] says how much a vertex must stay (1: hands, feet, face). Modes solve (L + c held M) x = lambda M x;
-    the standard deviation falls with the eigenvalue from DISPLACEMENT_SD_M, so that fine detail stays small. Modes
-    are symmetrised: each is even or odd under the left-right mirror.
+    `held` in [0, 1] says how much a vertex must stay (1: hands, feet, face). Modes solve (L + c held M) x =
+    lambda M x; the standard deviation falls with the eigenvalue from DISPLACEMENT_SD_M, so that fine detail
+    stays small. Modes are symmetrised: each is even or odd under the left-right mirror.
     """
     area = vertex_areas(v, f)
     mass = csc_matrix(diags(area))
     stiff = cotangent_laplacian(v, f) + diags(area * held * HOLD)
-    # The mirror commutes with the operator: even and odd modes are solved for apart, so that none is a mixture.
+    # The mirror commutes with the operator: even and odd modes are solved for apart, so that none is a
+    # mixture.
     everyone = np.arange(len(v))
     is_left = everyone <= partner
-    values, vectors, spread = [], [], []
+    by_sign: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for sign, base in ((1.0, is_left), (-1.0, everyone < partner)):
         own = np.flatnonzero(base)
         column = np.full(len(v), -1)
@@ -145,10 +146,8 @@ def displacement_components(
         found, modes = eigsh(
             extend.T @ stiff @ extend, n_components, extend.T @ mass @ extend, sigma=-1.0, v0=start
         )
-        values.append(found)
-        vectors.append(extend @ modes)
-        spread.append(np.full(n_components, 1.0 if sign > 0 else ASYMMETRY))
-    values, vectors, spread = np.concatenate(values), np.concatenate(vectors, 1), np.concatenate(spread)
+        by_sign.append((found, extend @ modes, np.full(n_components, 1.0 if sign > 0 else ASYMMETRY)))
+    values, vectors, spread = (np.concatenate(columns, -1) for columns in zip(*by_sign, strict=True))
     order = np.argsort(values, kind="stable")[:n_components]
     values, vectors, spread = values[order], vectors[:, order], spread[order]
     rms = np.sqrt((area[:, None] * vectors**2).sum(0) / area.sum())

@@ -32,14 +32,15 @@ MIRROR: Int[np.ndarray, "24"] = np.array([JOINT[_mirrored(name)] for name in JOI
 LEFT_JOINTS: tuple[int, ...] = tuple(j for j, name in enumerate(JOINT_NAMES) if name.startswith("left_"))
 
 
-def axis_angle_to_matrix(axis_angle: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
+def axis_angle_to_matrix(axis_angle: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
     """Rotation matrices of rotation vectors (radians), by Rodrigues' formula."""
-    vectors = np.asarray(axis_angle, dtype=np.float64).reshape(-1, 3)
+    vectors = axis_angle.reshape(-1, 3)
     angle = np.linalg.norm(vectors, axis=1)[:, None, None] + 1e-12  # any unit axis serves a zero angle
     x, y, z = (vectors / angle[:, :, 0]).T
     zero = np.zeros_like(x)
     cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    rotations = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return rotations.reshape(*axis_angle.shape, 3)
 
 
 def world_from_rest(
@@ -65,7 +66,9 @@ def world_from_rest(
 def blend_linearly(
     vertices: Float[np.ndarray, "v 3"], weights: Float[np.ndarray, "v j"], bones: Float[np.ndarray, "j 4 4"]
 ) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3 3"]]:
-    """Linear blend skinning in plain numpy (the reference of `skinning.skin`): posed vertices, blended matrices."""
+    """Linear blend skinning in plain numpy (the reference of `skinning.skin`): posed vertices, blended
+    matrices.
+    """
     blended = np.einsum("vj,jab->vab", weights, bones[:, :3])
     posed = np.einsum("vab,vb->va", blended[:, :, :3], vertices) + blended[:, :, 3]
     return posed, blended[:, :, :3]

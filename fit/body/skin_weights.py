@@ -1,4 +1,4 @@
-"""Skinning weights: smooth ramps across a tilted plane at each joint, from the root outwards, then diffusion."""
+"""Skinning weights: ramps across a tilted plane at each joint, from the root outwards, then diffusion."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -47,8 +47,8 @@ def make_skin_weights(
     def joint(name: str) -> Float[np.ndarray, "3"]:
         return joints[JOINT[name]]
 
-    def across(name: str, normal: np.ndarray | list[float], low: float, high: float, offset: float = 0.0):  # noqa: ANN202
-        return smooth_step(low, high, (p - joint(name)) @ np.asarray(normal) - offset)
+    def across(name: str, normal: np.ndarray, low: float, high: float, offset: float = 0.0) -> np.ndarray:
+        return smooth_step(low, high, (p - joint(name)) @ normal - offset)
 
     p = np.stack([np.abs(vertices[:, 0]), vertices[:, 1], vertices[:, 2]], 1)  # everything as if on the left
     x, y = p[:, 0], p[:, 1]
@@ -60,8 +60,8 @@ def make_skin_weights(
         ("spine2", "spine3", 0.005, 0.050),
     ):
         hand.on((parent,), child, smooth_step(-half, half, y - joint(child)[1] - offset))
-    hand.on(("spine3",), "neck", across("neck", [0, 0.88, 0.47], -0.035, 0.035, 0.002))
-    hand.on(("neck",), "head", across("head", [0, 0.80, 0.60], -0.032, 0.032, 0.012))
+    hand.on(("spine3",), "neck", across("neck", np.array([0, 0.88, 0.47]), -0.035, 0.035, 0.002))
+    hand.on(("neck",), "head", across("head", np.array([0, 0.80, 0.60]), -0.032, 0.032, 0.012))
 
     collar = smooth_step(0.015, 0.135, x) * smooth_step(level(0.742), level(0.805), y) * (y < level(0.87))
     # The side of the chest must not follow a raised arm: the arm's zone fades out below the armpit.
@@ -74,11 +74,11 @@ def make_skin_weights(
     # The groin's plane runs from the crotch up to outside the hip joint; at the midline both legs pull half.
     below_groin = (p - joint("left_hip")) @ np.array([0.42, -0.907, 0.0])
     hip = smooth_step(-0.075, 0.065, below_groin)
-    hip *= np.where(below_groin < 0.05, 0.35 + 0.65 * smooth_step(0, 0.05, x), 1)
+    hip *= np.where(below_groin < 0.05, 0.35 + 0.65 * smooth_step(0.0, 0.05, x), 1)
     hip *= (y < level(0.60)) & (x < 0.5)
     leg_down = unit(joint("left_ankle") - joint("left_hip"))
     knee = across("left_knee", leg_down, -0.050, 0.050)
-    ankle = across("left_ankle", [0, -0.86, 0.51], -0.032, 0.032, 0.004)
+    ankle = across("left_ankle", np.array([0, -0.86, 0.51]), -0.032, 0.032, 0.004)
     forward = unit((joint("left_foot") - joint("left_ankle")) * [1, 0, 1])
     toes = across("left_foot", forward, -0.022, 0.022, 0.004)
 

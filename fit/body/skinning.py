@@ -2,15 +2,14 @@
 
     v_i = A_i (T_i + P_i(pose)) + c_i + translation,   A_i = sum_k w_ik R_k,   at most four bones k a vertex
 
-T is any template, not only the model's: that is what the paper's free-form unknown needs (Zhang et al. 2017, section 3).
-Joints are given, so the caller decides whether they follow the betas or stay. Call `fit.jax_setup.setup_jax` first
-(SkinningArrays.of does). Metres, radians; everything in the body's frame but for the final translation.
+T is any template, not only the model's: that is what the paper's free-form unknown needs (Zhang et al. 2017,
+section 3). Joints are given, so the caller decides whether they follow the betas or stay. Call
+`fit.jax_setup.setup_jax` first (SkinningArrays.of does). Metres, radians; everything in the body's frame but
+for the final translation.
 
-The Jacobian is analytic: turning joint j by a small rotation moves everything behind it about the joint's posed
-position, so one pass over (vertex, bone) pairs serves all pose parameters.
+The Jacobian is analytic: turning joint j by a small rotation moves everything behind it about the joint's
+posed position, so one pass over (vertex, bone) pairs serves all pose parameters.
 """
-
-from __future__ import annotations
 
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
@@ -46,9 +45,9 @@ SMALLEST_CORRECTIVE_M = 1e-7  # correctives below it (a tenth of a micrometre at
 class SkinningArrays:
     """A body model on the device, made once and passed to every function here (a JAX pytree).
 
-    template (V 3), shape_directions (V 3 B), joint_template (J 3), joint_directions (J 3 B), bone_idx and bone_weight
-    (V 4), weights (V J), and the correctives as C pairs of a vertex and a joint that moves it: corrective_vertex (C),
-    corrective_joint (C), correctives (C 3 9); most vertices are touched by few joints.
+    template (V 3), shape_directions (V 3 B), joint_template (J 3), joint_directions (J 3 B), bone_idx and
+    bone_weight (V 4), weights (V J), and the correctives as C pairs of a vertex and a joint that moves it:
+    corrective_vertex (C), corrective_joint (C), correctives (C 3 9); most vertices are touched by few joints.
     """
 
     def __init__(
@@ -72,7 +71,7 @@ class SkinningArrays:
         self.correctives, self.parents = correctives, parents
 
     @staticmethod
-    def of(model: BodyModel) -> SkinningArrays:
+    def of(model: "BodyModel") -> "SkinningArrays":
         """Move a model to the device (starts JAX, in double precision)."""
         from fit.jax_setup import setup_jax
 
@@ -82,7 +81,9 @@ class SkinningArrays:
         strongest = strongest / strongest.sum(1, keepdims=True)
         compact = np.zeros_like(model.weights)
         np.put_along_axis(compact, order, strongest, 1)
-        by_joint = model.pose_directions.reshape(model.n_vertices, 3, model.n_joints - 1, 9).transpose(0, 2, 1, 3)
+        by_joint = model.pose_directions.reshape(model.n_vertices, 3, model.n_joints - 1, 9).transpose(
+            0, 2, 1, 3
+        )
         vertex, joint = np.nonzero(np.abs(by_joint).max((2, 3)) > SMALLEST_CORRECTIVE_M)
         if not len(vertex):  # a model without correctives keeps one that does nothing: shapes stay simple
             vertex, joint = np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64)
@@ -90,7 +91,9 @@ class SkinningArrays:
             template=jnp.asarray(model.template),
             shape_directions=jnp.asarray(model.shape_directions),
             joint_template=jnp.asarray(model.joint_regressor @ model.template),
-            joint_directions=jnp.asarray(np.einsum("jv,vcb->jcb", model.joint_regressor, model.shape_directions)),
+            joint_directions=jnp.asarray(
+                np.einsum("jv,vcb->jcb", model.joint_regressor, model.shape_directions)
+            ),
             bone_idx=jnp.asarray(order, dtype=jnp.int32),
             bone_weight=jnp.asarray(strongest),
             weights=jnp.asarray(compact),
@@ -116,8 +119,10 @@ def _cross_matrix(vectors: Float[Array, "... 3"]) -> Float[Array, "... 3 3"]:
     )
 
 
-def _series(squared_angle: Float[Array, "n"]) -> tuple[Float[Array, "n"], Float[Array, "n"], Float[Array, "n"]]:
-    """sin t / t, (1 - cos t) / t2, (t - sin t) / t3, by Taylor's series near zero (where the quotients lose digits)."""
+def _series(
+    squared_angle: Float[Array, "n"],
+) -> tuple[Float[Array, "n"], Float[Array, "n"], Float[Array, "n"]]:
+    """sin t / t, (1 - cos t) / t2, (t - sin t) / t3; a series near zero, where quotients lose digits."""
     small = squared_angle < 1e-4
     safe = jnp.where(small, 1.0, squared_angle)
     angle = jnp.sqrt(safe)
@@ -137,7 +142,7 @@ def rotation_matrices(axis_angle: Float[Array, "n 3"]) -> Float[Array, "n 3 3"]:
 
 
 def left_jacobians(axis_angle: Float[Array, "n 3"]) -> Float[Array, "n 3 3"]:
-    """Columns: the small rotation (radians, in the parent's axes) that a change of each vector entry causes."""
+    """Columns: the small rotation (rad, in the parent's axes) that a change of each vector entry causes."""
     _, versine, rest = _series((axis_angle**2).sum(-1))
     cross = _cross_matrix(axis_angle)
     return jnp.eye(3) + versine[:, None, None] * cross + rest[:, None, None] * cross @ cross
@@ -189,7 +194,7 @@ def skin(
     pose: Float[Array, "j 3"],
     translation: Float[Array, "3"],
 ) -> Float[Array, "v 3"]:
-    """Posed vertices of a free-form template; `pose` holds rotation vectors, the root's about its own joint."""
+    """Posed vertices of a free-form template; `pose`: rotation vectors, the root's about its own joint."""
     bones = _bones(joints, pose, arrays.parents)
     rotations, offsets = _blend(arrays, bones)
     corrected = _corrected(arrays, template, bones.rotations)
@@ -217,9 +222,9 @@ def skin_with_jacobian(
 ) -> tuple[Float[Array, "v 3"], Float[Array, "v 3 3"], Float[Array, "v 3 p"]]:
     """Posed vertices, dv/dT (V 3 3: the blended rotations), and dv/d(pose, translation, betas) (V 3 P).
 
-    P = 3 J + 3 + B: pose joint by joint, translation, then the betas as far as they move the JOINTS; what they do to
-    the template is not in it, since the template is an unknown of its own (add rotations @ shape_directions for the
-    model's own template).
+    P = 3 J + 3 + B: pose joint by joint, translation, then the betas as far as they move the JOINTS; what
+    they do to the template is not in it, since the template is an unknown of its own (add rotations @
+    shape_directions for the model's own template).
     """
     parents = arrays.parents
     n_vertices, n_joints = template.shape[0], len(parents)
@@ -229,13 +234,15 @@ def skin_with_jacobian(
     vertices = jnp.einsum("vab,vb->va", rotations, corrected) + offsets
 
     # Where each of a vertex's bones would take it, times its weight; and which bones lie behind each joint.
-    taken = jnp.einsum("vkab,vb->vka", bones.world[arrays.bone_idx], corrected) + bones.offsets[arrays.bone_idx]
+    taken = (
+        jnp.einsum("vkab,vb->vka", bones.world[arrays.bone_idx], corrected) + bones.offsets[arrays.bone_idx]
+    )
     taken = taken * arrays.bone_weight[:, :, None]
     behind = jnp.asarray(_descendants(parents))[:, arrays.bone_idx]  # (J V 4)
     share = (behind * arrays.bone_weight).sum(-1)  # (J V)
     arm = jnp.einsum("jvk,vka->jva", behind, taken) - share[:, :, None] * bones.posed_joints[:, None]
 
-    # Small world rotations per pose entry: the parent's bone frame carries the left Jacobian of the joint's vector.
+    # Small world rotations per pose entry: the parent's frame carries the joint's left Jacobian.
     turn = left_jacobians(pose)
     parent_world = jnp.concatenate([jnp.eye(3)[None], bones.world[jnp.asarray(parents[1:])]])
     axes = parent_world @ turn  # (J 3 3): column a is the axis of entry a

@@ -1,18 +1,18 @@
 """Section tables of the average body: half widths and depths in metres by anatomical station.
 
-Modelled by hand on the average of the survey (`anthropometry.survey_mean`) and corrected by a tape on finished
-meshes; landmark heights after Drillis & Contini 1966, Winter 1990 and de Leva 1996, adapted.
+Modelled by hand on the average of the survey (`anthropometry.survey_mean`) and corrected by a tape on
+finished meshes; landmark heights after Drillis & Contini 1966, Winter 1990 and de Leva 1996, adapted.
 `anatomy` scales every row with the person's own girths.
 """
 
 # Torso stations: height/stature, half width M F, front M F, back M F, exponents front back,
 # girth that scales the station, share of that scaling taken by width/front/back.
 TORSO = [
-    (0.476, 0.095, 0.098, 0.062, 0.060, 0.085, 0.085, 2.0, 2.0, "hip",   (1.0, 1.0, 1.0)),
-    (0.490, 0.134, 0.138, 0.080, 0.076, 0.098, 0.098, 2.1, 2.1, "hip",   (1.0, 1.0, 1.0)),
-    (0.510, 0.158, 0.163, 0.096, 0.091, 0.108, 0.108, 2.2, 2.2, "hip",   (1.0, 1.0, 1.0)),
-    (0.535, 0.165, 0.168, 0.109, 0.103, 0.108, 0.110, 2.3, 2.2, "hip",   (1.08, 1.4, 1.1)),
-    (0.565, 0.166, 0.164, 0.119, 0.110, 0.103, 0.102, 2.3, 2.3, "hip",   (1.15, 1.9, 1.1)),
+    (0.476, 0.095, 0.098, 0.062, 0.060, 0.085, 0.085, 2.0, 2.0, "hip", (1.0, 1.0, 1.0)),
+    (0.490, 0.134, 0.138, 0.080, 0.076, 0.098, 0.098, 2.1, 2.1, "hip", (1.0, 1.0, 1.0)),
+    (0.510, 0.158, 0.163, 0.096, 0.091, 0.108, 0.108, 2.2, 2.2, "hip", (1.0, 1.0, 1.0)),
+    (0.535, 0.165, 0.168, 0.109, 0.103, 0.108, 0.110, 2.3, 2.2, "hip", (1.08, 1.4, 1.1)),
+    (0.565, 0.166, 0.164, 0.119, 0.110, 0.103, 0.102, 2.3, 2.3, "hip", (1.15, 1.9, 1.1)),
     (0.600, 0.162, 0.150, 0.127, 0.111, 0.099, 0.092, 2.3, 2.4, "waist", (1.05, 1.5, 1.0)),
     (0.632, 0.157, 0.137, 0.125, 0.102, 0.100, 0.088, 2.3, 2.4, "waist", (1.05, 1.5, 1.0)),
     (0.668, 0.153, 0.134, 0.120, 0.098, 0.108, 0.097, 2.4, 2.4, "waist", (0.95, 1.25, 1.0)),
@@ -22,7 +22,7 @@ TORSO = [
     (0.785, 0.156, 0.129, 0.101, 0.083, 0.128, 0.114, 2.3, 2.4, "chest", (0.9, 1.0, 1.1)),
     (0.808, 0.127, 0.105, 0.075, 0.061, 0.116, 0.104, 2.2, 2.3, "chest", (0.8, 0.9, 1.0)),
     (0.826, 0.085, 0.072, 0.042, 0.035, 0.091, 0.082, 2.1, 2.2, "chest", (0.5, 0.7, 0.8)),
-    (0.840, 0.060, 0.050, 0.026, 0.020, 0.074, 0.066, 2.0, 2.0, "neck",  (1.0, 1.0, 1.0)),
+    (0.840, 0.060, 0.050, 0.026, 0.020, 0.074, 0.066, 2.0, 2.0, "neck", (1.0, 1.0, 1.0)),
 ]
 # Leg: 0 hip, 1 knee, 2 ankle.  lateral, medial, front, back, girth.
 LEG = [
@@ -55,8 +55,8 @@ ARM = [
     (0.40, 0.049, 0.050, 0.054, 0.053, "biceps"),
     (0.60, 0.046, 0.047, 0.051, 0.049, "biceps"),
     (0.80, 0.041, 0.042, 0.045, 0.044, "biceps"),
-    (1.00, 0.039, 0.040, 0.040, 0.042, "forearm"),
-    (1.15, 0.042, 0.042, 0.044, 0.042, "forearm"),
+    (1.00, 0.0375, 0.0395, 0.0405, 0.043, "forearm"),
+    (1.15, 0.0400, 0.0415, 0.0455, 0.0430, "forearm"),
     (1.30, 0.042, 0.041, 0.044, 0.041, "forearm"),
     (1.50, 0.036, 0.036, 0.040, 0.037, "forearm"),
     (1.75, 0.026, 0.027, 0.033, 0.031, "wrist"),
@@ -134,7 +134,8 @@ TAPE_CORRECTION: dict[str, tuple[float, float, float]] = {
     "forearm": (0.008, 0.000, -0.001),
     "wrist": (0.050, -0.057, -0.345),
 }
-"""Log of (tape on the mesh / girth modelled): constant, per sex - 0.5, per log of the girth over its sex's average.
+"""Log of (tape on the mesh / girth modelled): constant, per sex - 0.5, per log of the girth over its sex's
+average.
 
 Regressed on 120 drawn people in three rounds; the tape is `tape.girths`.
 """

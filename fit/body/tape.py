@@ -1,7 +1,8 @@
 """A tape around a finished mesh: girths, volume and extents as an anthropometrist would read them.
 
 Standing T-pose, y up, metres. A girth is the convex perimeter of a plane section, as a tape bridges hollows.
-Landmark levels follow the survey's definitions (Gordon et al. 2014) as fractions of the average body's stature.
+Landmark levels follow the survey's definitions (Gordon et al. 2014) as fractions of the average body's
+stature.
 """
 
 from collections.abc import Callable
@@ -28,7 +29,8 @@ def girth(
     normal: Float[np.ndarray, "3"],
     keep: Callable[[Float[np.ndarray, "n 3"]], np.ndarray],
 ) -> float:
-    """Convex perimeter of the section through `point` across `normal`, of those section points that `keep` accepts.
+    """Convex perimeter of the section through `point` across `normal`, of those section points that `keep`
+    accepts.
 
     Raises ValueError where the plane misses the mesh or `keep` leaves fewer than three points.
     """
@@ -54,7 +56,8 @@ def girths(
 ) -> dict[str, float]:
     """The eleven girths of `anthropometry.GIRTHS` on a body in the T-pose.
 
-    `level` turns a fraction of stature into this body's height (`anatomy.height_map`, in the frame of the vertices).
+    `level` turns a fraction of stature into this body's height (`anatomy.height_map`, in the frame of the
+    vertices).
     """
     shoulder, elbow, wrist = (joints[JOINT[name]] for name in ("left_shoulder", "left_elbow", "left_wrist"))
     up, along_arm = np.array([0.0, 1.0, 0.0]), wrist - shoulder
@@ -77,9 +80,7 @@ def girths(
 
     def neck(fraction: float) -> float:
         point = np.array([0, level(fraction), -0.02])
-        return girth(
-            vertices, faces, point, neck_normal, lambda p: np.linalg.norm(p - point, axis=1) < 0.11
-        )
+        return girth(vertices, faces, point, neck_normal, lambda p: np.linalg.norm(p - point, axis=1) < 0.11)
 
     return {
         "neck": min(neck(f) for f in (0.855, 0.865, 0.872, 0.880)),
