@@ -64,9 +64,9 @@ def bounds_from_tables(tables: Sequence[SilhouetteTable]) -> Bounds:
     reach = float(np.median([np.linalg.norm(table.centre - subject) for table in tables]))
     grid = Grid(subject - reach, 2 * reach / _N_CELLS, (_N_CELLS, _N_CELLS, _N_CELLS))
     count = possible_witnesses(tables, rule, grid, votes=2 if len(tables) >= 4 else 1)
-    piece, n_pieces = label(count > 0, structure=np.ones((3, 3, 3), dtype=bool))
-    if not n_pieces:
+    if not count.any():
         raise HullError(why_empty(tables, rule, subject - reach, subject + reach))
+    piece, _ = label(count > 0, structure=np.ones((3, 3, 3), dtype=bool))
     vouched = np.bincount(piece.ravel(), count.ravel())
     person = find_objects(piece)[int(np.argmax(vouched[1:]))]
     first, end = np.array([[s.start, s.stop] for s in person]).T

@@ -76,19 +76,26 @@ class Blocks:
 
 @dataclass
 class _Front:
-    """The cells still in question at one level, and what is known of them. Columns are cells."""
+    """The cells still in question at one level, and what is known of them. Columns are cells.
+
+    Sets of cameras, as bits: `unasked` may still decide, `inside` see the whole cell inside, `hopeful` may see
+    some of it inside (so they hold the `inside` ones).
+    """
 
     cells: Int[np.ndarray, "3 n"]
     unasked: UInt64[np.ndarray, "w n"]
     inside: UInt64[np.ndarray, "w n"]
+    hopeful: UInt64[np.ndarray, "w n"]
     n_outside: np.ndarray
 
     def kept(self, keep: np.ndarray) -> _Front:
-        return _Front(self.cells[:, keep], self.unasked[:, keep], self.inside[:, keep], self.n_outside[keep])
+        sets = (self.unasked[:, keep], self.inside[:, keep], self.hopeful[:, keep])
+        return _Front(self.cells[:, keep], *sets, self.n_outside[keep])
 
     def children(self) -> _Front:
         cells = (2 * self.cells[:, :, None] + _CHILDREN[:, None, :]).reshape(3, -1)
-        repeat = [np.repeat(a, 8, axis=-1) for a in (self.unasked, self.inside, self.n_outside)]
+        known = (self.unasked, self.inside, self.hopeful, self.n_outside)
+        repeat = [np.repeat(a, 8, axis=-1) for a in known]
         return _Front(cells.astype(np.int32), *repeat)
 
 
@@ -136,7 +143,7 @@ def possible_witnesses(
         centres = grid.centres(front.cells, side)
         front = _ask(tables, rule, front, centres, 0.5 * side * grid.voxel_m, votes, order)
         final = np.full(front.cells.shape[1], level == 0) | ~front.unasked.any(axis=0)
-        count = np.bitwise_count(front.inside | front.unasked).sum(axis=0, dtype=np.int32)[final]
+        count = np.bitwise_count(front.hopeful).sum(axis=0, dtype=np.int32)[final]
         i, j, k = front.cells[:, final]
         nx, ny, nz = (n // side for n in found.shape)
         found.reshape(nx, side, ny, side, nz, side)[i, :, j, :, k, :] = count[:, None, None, None]
@@ -152,6 +159,7 @@ def _first_front(rule: WitnessRule, n: Sequence[int]) -> _Front:
         cells,
         np.repeat(full[:, None], cells.shape[1], axis=1),
         np.zeros((len(full), cells.shape[1]), dtype=np.uint64),
+        np.repeat(full[:, None], cells.shape[1], axis=1),
         np.zeros(cells.shape[1], dtype=np.uint8),
     )
 
@@ -170,7 +178,7 @@ def _ask(
     Sorts `order`, so that the camera that rejects most is asked first on the next level.
     """
     alive = np.ones(centres.shape[1], dtype=bool)
-    unseen = False
+    hopeless = False
     n_rejected = np.zeros(len(tables))
     n_asked = np.zeros(len(tables))
     for camera in order:
@@ -193,17 +201,18 @@ def _ask(
         front.inside[word, inside] |= bit
         front.unasked[word, inside] &= ~bit
         blind = selected[answers == NO_EVIDENCE]
-        if len(blind):
-            unseen = True
-            front.unasked[word, blind] &= ~bit
+        front.unasked[word, blind] &= ~bit
+        never = selected[(answers & INSIDE) == 0]
+        front.hopeful[word, never] &= ~bit
+        hopeless = hopeless or len(never) > len(outside)
         n_asked[camera] = len(selected)
         n_rejected[camera] = len(outside)
     rejects = n_rejected / np.maximum(n_asked, 1)
     order.sort(key=lambda camera: -float(rejects[camera]))
     front = front.kept(alive)
-    if unseen or votes > 1:
+    if hopeless or votes > 1:
         # Space that too few cameras can still vouch for is given up early, or it would be split to the end.
-        front = front.kept(rule.enough(front.unasked | front.inside))
+        front = front.kept(rule.enough(front.hopeful))
     return front
 
 

@@ -48,10 +48,8 @@ def keep_what_matters(
     vertices, faces = compacted(vertices, faces[keep[label]])
     notes = []
     if phantoms:
-        notes.append(
-            f"left out {len(phantoms)} separate pieces ({sum(phantoms) * 1000:.2f} L) "
-            "that no silhouette needs"
-        )
+        pieces = "1 separate piece" if len(phantoms) == 1 else f"{len(phantoms)} separate pieces"
+        notes.append(f"left out {pieces} ({sum(phantoms) * 1000:.2f} L) that no silhouette needs")
     if keep.sum() > 1:
         parts = ", ".join(f"{volume * 1000:.2f} L" for volume in sorted(volumes[keep], reverse=True))
         notes.append(f"the hull is in {keep.sum()} separate pieces ({parts})")

@@ -147,10 +147,10 @@ class SilhouetteTable:
     ) -> UInt8[np.ndarray, " n"]:
         """The OR of all blocks that rectangles of codes touch, as four overlapping squares of one level."""
         levels, height, width = self.squares.shape
-        x_0 = np.clip((column_0 - self.origin[0]) >> 2, 0, width - 1)
-        x_1 = np.clip((column_1 - self.origin[0]) >> 2, 0, width - 1)
-        y_0 = np.clip((row_0 - self.origin[1]) >> 2, 0, height - 1)
-        y_1 = np.clip((row_1 - self.origin[1]) >> 2, 0, height - 1)
+        left, right = (column_0 - self.origin[0]) >> 2, (column_1 - self.origin[0]) >> 2
+        top, bottom = (row_0 - self.origin[1]) >> 2, (row_1 - self.origin[1]) >> 2
+        x_0, x_1 = np.clip(left, 0, width - 1), np.clip(right, 0, width - 1)
+        y_0, y_1 = np.clip(top, 0, height - 1), np.clip(bottom, 0, height - 1)
         side = np.maximum(x_1 - x_0, y_1 - y_0) + 1
         level = _LEVEL_OF_SIDE.take(np.minimum(side, len(_LEVEL_OF_SIDE) - 1))
         too_large = level >= levels
@@ -167,6 +167,8 @@ class SilhouetteTable:
             flat.take(upper + x_0) | flat.take(upper + x_1) | flat.take(lower + x_0) | flat.take(lower + x_1)
         )
         answers[too_large] = UNDECIDED
+        # All that is not stored is background (or beyond the picture, which the caller adds).
+        answers[(right < 0) | (left >= width) | (bottom < 0) | (top >= height)] = OUTSIDE
         return answers
 
 
@@ -269,6 +271,7 @@ def _classes(codes: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h/4 w/4"]:
     classes[any_block < _UNKNOWN_BIT] = INSIDE | OUTSIDE
     classes[any_block == 0] = OUTSIDE
     classes[(all_block == 15) & (any_block == 15)] = INSIDE
+    classes[any_block == _UNKNOWN_BIT] = OUTSIDE | NO_EVIDENCE
     classes[all_block >= _UNKNOWN_BIT] = NO_EVIDENCE
     return classes
 
