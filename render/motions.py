@@ -62,6 +62,11 @@ def _ease(phase: float) -> float:
     return phase * phase * (3 - 2 * phase)
 
 
+def _softly_above(value: float, low: float) -> float:
+    """max(value, low) with its corner rounded: joints have no jerk."""
+    return low + 0.5 * (value - low + float(np.hypot(value - low, 0.3)))
+
+
 def _tilt_twist(phase: float, size: float) -> _Moment:
     """Leans forward and sideways while the trunk turns left, arms half out."""
     lean, turn = size * _wave(phase), size * np.sin(2 * np.pi * phase)
@@ -110,7 +115,7 @@ def _shoulders_mill(phase: float, size: float) -> _Moment:
         angle = 2 * np.pi * (phase + shift)
         lift = -0.45 + 0.85 * size * np.sin(angle)
         swing = 0.8 * size * np.cos(angle)
-        joints[f"{side}_collar"] = (0.0, -0.12 * sign * swing, 0.22 * sign * max(lift, -0.3))
+        joints[f"{side}_collar"] = (0.0, -0.12 * sign * swing, 0.22 * sign * _softly_above(lift, -0.3))
         joints[f"{side}_shoulder"] = (0.0, -0.7 * sign * swing, 0.85 * sign * lift)
         joints[f"{side}_elbow"] = (0.0, -sign * (0.45 - 0.2 * np.sin(angle)), 0.0)
     return _Moment(joints)
