@@ -6,6 +6,7 @@ the result: CC0.
 """
 
 import hashlib
+import zipfile
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
@@ -91,11 +92,11 @@ def _shared_half_mesh(
     """The half mesh that all sexes share, from the cache where it is."""
     path = folder / "half-mesh.npz"
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             half, faces = stored["half"], stored["faces"]
         progress(half_mesh.N_ROUNDS)
         return half, faces
-    except (OSError, ValueError, KeyError, EOFError):
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         half, faces = half_mesh.make_half_mesh(progress)
     temporary = path.with_suffix(f".{np.random.default_rng().integers(1 << 40):x}.npz")
     try:
@@ -166,6 +167,6 @@ def _held(
     """Where the displacement components must vanish: hands, feet, and the head but for its neck side."""
     held = region_mask(parts, "hand", "foot").astype(np.float64)
     head = parts == JOINT["head"]
-    return np.maximum(
-        held, head * half_mesh.smooth_step(-0.02, 0.03, template[:, 1] - joints[JOINT["head"], 1])
-    )
+    above = half_mesh.smooth_step(-0.02, 0.03, template[:, 1] - joints[JOINT["head"], 1])
+    jaw = half_mesh.smooth_step(0.02, 0.04, template[:, 2])
+    return np.maximum(held, head * np.maximum(above, jaw))

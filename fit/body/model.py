@@ -249,7 +249,8 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
             f"Convert it to an .npz with the keys {', '.join(SMPL_KEYS)}."
         )
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        # numpy leaves a file that it opened itself open when the archive is damaged
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             arrays = {}
             for key in archive.files:
                 try:

@@ -13,6 +13,7 @@ as three plain numbers: right for single-axis bends, good enough for a prior els
 
 import os
 import tempfile
+import zipfile
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -144,9 +145,9 @@ class PosePrior:
         """Read an .npz with mean (69,) and covariance (69, 69); low and high may be missing."""
         path = Path(path)
         try:
-            with np.load(path, allow_pickle=False) as stored:
+            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
                 arrays = {key: np.asarray(stored[key], dtype=np.float64) for key in stored.files}
-        except (OSError, ValueError, EOFError) as error:
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
             raise ValueError(
                 f"{path}: not a readable pose prior ({error}). Give an .npz with mean and covariance."
             ) from error
@@ -191,5 +192,6 @@ def _nearest_correlation(matrix: Float[np.ndarray, "a a"]) -> Float[np.ndarray, 
     """A positive definite correlation matrix near one of hand-set couplings (small eigenvalues lifted)."""
     values, vectors = np.linalg.eigh(matrix)
     lifted = (vectors * np.maximum(values, 0.05)) @ vectors.T
+    lifted = 0.5 * (lifted + lifted.T)
     scale = 1 / np.sqrt(np.diag(lifted))
     return lifted * np.outer(scale, scale)

@@ -1,0 +1,256 @@
+"""The free body keeps its promises, and body files round-trip or say what is wrong with them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fit.body import BodyModel, BodyModelError, load_body
+from fit.body.parts import BODY_25, REGIONS, region_mask, region_of_vertices
+from fit.body.skeleton import JOINT, MIRROR, PARENTS
+from fit.body.tape import volume_m3
+
+
+@pytest.fixture(scope="module", params=["neutral", "female", "male"])
+def body(request: pytest.FixtureRequest) -> BodyModel:
+    return load_body(f"free:{request.param}", show_progress=False)
+
+
+def small_body(**changes: np.ndarray) -> dict[str, np.ndarray]:
+    """Arrays of the neutral body under SMPL's keys, as somebody else's file might hold them."""
+    body = load_body("free:neutral", show_progress=False)
+    arrays = {
+        "v_template": body.template.astype(np.float32),
+        "f": body.faces.astype(np.uint32),
+        "shapedirs": body.shape_directions[:, :, :10].astype(np.float32),
+        "posedirs": body.pose_directions.astype(np.float32),
+        "weights": body.weights.astype(np.float32),
+        "J_regressor": body.joint_regressor.astype(np.float32),
+        "kintree_table": np.array([[2**32 - 1, *PARENTS[1:]], range(24)], dtype=np.uint32),
+    }
+    return {**arrays, **changes}
+
+
+def test_it_has_smpl_s_structure(body: BodyModel) -> None:
+    assert body.template.shape == (6890, 3)
+    assert body.faces.shape == (13776, 3)
+    assert tuple(body.parents) == PARENTS
+    assert body.pose_directions.shape == (6890, 3, 207)
+    assert body.n_betas > body.n_anthropometric >= 16
+    assert body.licence == "CC0-1.0"
+    assert body.template.dtype == np.float64
+
+
+def test_its_mesh_is_closed_manifold_and_oriented_outwards(body: BodyModel) -> None:
+    directed = np.concatenate([body.faces[:, [0, 1]], body.faces[:, [1, 2]], body.faces[:, [2, 0]]])
+    assert len(np.unique(directed, axis=0)) == len(directed)
+    edges, count = np.unique(np.sort(directed, 1), axis=0, return_counts=True)
+    assert (count == 2).all()
+    assert 6890 - len(edges) + len(body.faces) == 2
+    assert 0.05 < volume_m3(body.template, body.faces) < 0.10
+
+
+def test_left_and_right_are_mirror_images(body: BodyModel) -> None:
+    from scipy.spatial import cKDTree
+
+    flip = np.array([-1.0, 1.0, 1.0])
+    distance, partner = cKDTree(body.template).query(body.template * flip)
+    assert distance.max() < 1e-8
+    np.testing.assert_allclose(body.weights[partner][:, MIRROR], body.weights, atol=1e-9)
+    anthropometric = body.shape_directions[:, :, : body.n_anthropometric]
+    np.testing.assert_allclose(anthropometric[partner] * flip[:, None], anthropometric, atol=1e-8)
+    bumps = body.shape_directions[:, :, body.n_anthropometric :]
+    seen = bumps[partner] * flip[:, None]
+    even, odd = np.abs(seen - bumps).max((0, 1)), np.abs(seen + bumps).max((0, 1))
+    assert np.minimum(even, odd).max() < 1e-6
+    joints = body.joint_regressor @ body.template
+    np.testing.assert_allclose(joints[MIRROR] * flip, joints, atol=1e-8)
+
+
+def test_weights_and_regressor_are_convex_and_sparse(body: BodyModel) -> None:
+    for rows in (body.weights, body.joint_regressor, body.landmarks):
+        np.testing.assert_allclose(rows.sum(1), 1, atol=1e-9)
+        assert rows.min() >= 0
+    assert (body.weights > 0).sum(1).max() <= 4
+    assert (body.joint_regressor > 0).sum(1).max() < 400
+
+
+def test_joints_lie_inside_the_body_and_the_pelvis_at_the_origin(body: BodyModel) -> None:
+    joints = body.joint_regressor @ body.template
+    assert np.linalg.norm(joints[0]) < 0.01
+    down, up = body.template[:, 1].min(), body.template[:, 1].max()
+    share = (joints[:, 1] - down) / (up - down)
+    for name, low, high in (
+        ("left_ankle", 0.03, 0.07),
+        ("left_knee", 0.25, 0.30),
+        ("left_hip", 0.48, 0.54),
+        ("head", 0.85, 0.90),
+    ):
+        assert low < share[JOINT[name]] < high, f"{name} at {share[JOINT[name]]:.3f} of stature"
+
+
+def test_displacement_components_leave_hands_feet_and_face_alone(body: BodyModel) -> None:
+    still = region_mask(body.parts, "hand", "foot")
+    face = (body.parts == JOINT["head"]) & (body.template[:, 2] > 0.06)
+    size = np.linalg.norm(body.shape_directions, axis=1)[:, body.n_anthropometric :]
+    moved = size[region_mask(body.parts, "torso", "arm", "leg")].max(0)
+    assert (moved > 1e-3).all()
+    assert size[face].max() < 1e-3
+    assert np.median(size[still]) < 1e-4
+    area_rms = np.sqrt((size**2).mean(0))
+    assert area_rms.max() < 0.006
+
+
+def test_every_vertex_has_a_part_and_a_region(body: BodyModel) -> None:
+    regions = region_of_vertices(body)
+    assert set(regions) == set(REGIONS)
+    assert set(body.parts) == set(range(24))
+    assert (region_mask(body.parts, "arm") == (regions == "arm")).all()
+
+
+def test_landmarks_are_where_their_names_say(body: BodyModel) -> None:
+    points = dict(zip(BODY_25, body.landmarks @ body.template, strict=True))
+    assert points["left_wrist"][0] > points["left_elbow"][0] > points["left_shoulder"][0] > 0.1
+    assert points["nose"][2] > points["left_eye"][2] > points["left_ear"][2]
+    assert points["left_ear"][0] > points["left_eye"][0] > 0.02
+    assert points["left_eye"][1] > points["nose"][1]
+    assert points["left_heel"][2] < points["left_ankle"][2] < points["left_small_toe"][2]
+    assert points["left_big_toe"][2] > points["left_small_toe"][2]
+    assert points["left_small_toe"][0] > points["left_big_toe"][0]
+    for left in (name for name in BODY_25 if name.startswith("left_")):
+        right = left.replace("left_", "right_")
+        np.testing.assert_allclose(points[right] * [-1, 1, 1], points[left], atol=0.004)
+
+
+def test_saving_and_loading_changes_nothing(body: BodyModel, tmp_path: Path) -> None:
+    body.save(tmp_path / "body.npz")
+    again = BodyModel.load(tmp_path / "body.npz")
+    assert again.content_hash == body.content_hash
+    assert (again.name, again.licence, again.n_anthropometric) == (
+        body.name,
+        body.licence,
+        body.n_anthropometric,
+    )
+    np.testing.assert_array_equal(again.landmarks, body.landmarks)
+    assert [p.name for p in tmp_path.iterdir()] == ["body.npz"]
+
+
+def test_the_three_sexes_share_one_mesh_and_differ() -> None:
+    bodies = [load_body(f"free:{sex}", show_progress=False) for sex in ("neutral", "female", "male")]
+    assert all((b.faces == bodies[0].faces).all() for b in bodies)
+    assert len({b.content_hash for b in bodies}) == 3
+    assert len({b.name for b in bodies}) == 3
+
+
+def test_building_is_deterministic() -> None:
+    from fit.body.build import _shared_half_mesh, build, cache_folder
+
+    load_body("free:neutral", show_progress=False)
+    half, faces = _shared_half_mesh(cache_folder(), lambda *_: None)
+    first, second = (build(half, faces, "female", n_people=130) for _ in range(2))
+    assert first.content_hash == second.content_hash
+
+
+def test_a_damaged_cache_is_built_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from fit.body import build as build_module
+
+    wanted = load_body("free:neutral", show_progress=False)
+    calls = []
+
+    def quick(*arguments: object, **_: object) -> BodyModel:
+        calls.append(arguments)
+        return wanted
+
+    monkeypatch.setattr(build_module, "build", quick)
+    monkeypatch.setattr(build_module, "_shared_half_mesh", lambda *_: (None, None))
+    (tmp_path / "neutral.npz").write_bytes(b"half a file")
+    build_module.load_or_build("neutral", show_progress=False, folder=tmp_path)
+    assert len(calls) == 1
+    again = build_module.load_or_build("neutral", show_progress=False, folder=tmp_path)
+    assert len(calls) == 1
+    assert again.content_hash == wanted.content_hash
+
+
+def test_a_file_with_smpl_s_keys_alone_gets_parts_and_landmarks(tmp_path: Path) -> None:
+    np.savez(tmp_path / "SMPL_NEUTRAL.npz", **small_body())
+    body = load_body(tmp_path / "SMPL_NEUTRAL.npz")
+    free = load_body("free:neutral", show_progress=False)
+    assert body.name == "SMPL_NEUTRAL"
+    assert body.parents[0] == -1
+    assert body.template.dtype == np.float64
+    assert (body.n_betas, body.n_anthropometric) == (10, 10)
+    assert (body.parts == free.parts).mean() > 0.999
+    np.testing.assert_allclose(body.landmarks @ body.template, free.landmarks @ free.template, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"posedirs": np.zeros((6890, 3, 100))}, r"pose_directions has shape \(6890, 3, 100\), expected"),
+        ({"weights": np.zeros((6890, 20))}, r"weights has shape \(6890, 20\), expected \(6890, 24\)"),
+        ({"J_regressor": np.zeros((24, 10))}, r"J_regressor has shape \(24, 10\), expected \(24, 6890\)"),
+        ({"weights": np.zeros((6890, 24))}, r"skinning weights of vertex 0 sum to 0.0000, not 1"),
+        ({"f": np.full((4, 3), 7000)}, r"faces name vertices from 7000 to 7000, but there are 6890"),
+        ({"f": np.zeros((0, 3))}, r"there are 6890 vertices and 0 faces"),
+        (
+            {"v_template": np.full((6890, 3), np.nan)},
+            r"template holds values that are not finite",
+        ),
+        (
+            {"v_template": np.zeros(6890)},
+            r"v_template is an array of shape \(6890,\).*expected numbers with 2",
+        ),
+        ({"kintree_table": np.zeros((2, 52))}, r"kintree_table has 52 joints; bodies with SMPL's 24 joints"),
+        ({"kintree_table": np.zeros((2, 24))}, r"kintree_table has 24 joints in another order"),
+    ],
+)
+def test_a_wrong_array_is_named(tmp_path: Path, changes: dict[str, np.ndarray], message: str) -> None:
+    np.savez(tmp_path / "wrong.npz", **small_body(**changes))
+    with pytest.raises(BodyModelError, match=message):
+        BodyModel.load(tmp_path / "wrong.npz")
+
+
+def test_a_missing_key_is_named_with_what_was_found(tmp_path: Path) -> None:
+    arrays = small_body()
+    del arrays["posedirs"]
+    np.savez(tmp_path / "partial.npz", **arrays)
+    with pytest.raises(
+        BodyModelError, match=r"partial\.npz: no posedirs in this body file \(found: J_regressor"
+    ):
+        BodyModel.load(tmp_path / "partial.npz")
+
+
+def test_unreadable_and_absent_files_are_named(tmp_path: Path) -> None:
+    (tmp_path / "cut.npz").write_bytes(b"PK\x03\x04 not the rest")
+    with pytest.raises(BodyModelError, match=r"cut\.npz: not a readable \.npz .*Copy or download"):
+        BodyModel.load(tmp_path / "cut.npz")
+    with pytest.raises(BodyModelError, match=r"nowhere\.npz: no such body file\. Use free:neutral"):
+        load_body(tmp_path / "nowhere.npz")
+    (tmp_path / "basic.pkl").write_bytes(b"")
+    with pytest.raises(BodyModelError, match=r"basic\.pkl: body files are read as \.npz, this is \.pkl"):
+        load_body(tmp_path / "basic.pkl")
+    with pytest.raises(BodyModelError, match="there is no such free body"):
+        load_body("free:child")
+
+
+def test_a_pickle_inside_is_not_opened(tmp_path: Path) -> None:
+    class Program:
+        def __reduce__(self) -> tuple[object, tuple[str]]:
+            return Path.touch, (tmp_path / "ran",)  # type: ignore[return-value]
+
+    arrays = small_body()
+    arrays["J_regressor"] = np.array(Program(), dtype=object)
+    np.savez(tmp_path / "trap.npz", **arrays)
+    with pytest.raises(
+        BodyModelError, match="J_regressor is stored as a pickled object, which is not opened"
+    ):
+        BodyModel.load(tmp_path / "trap.npz")
+    assert not (tmp_path / "ran").exists()
+
+
+def test_fewer_betas_can_be_kept() -> None:
+    body = load_body("free:neutral", show_progress=False)
+    plain = body.with_betas(body.n_anthropometric)
+    assert plain.n_betas == plain.n_anthropometric == body.n_anthropometric
+    betas = np.random.default_rng(0).standard_normal(plain.n_betas)
+    np.testing.assert_allclose(plain.shaped(betas), body.shaped(betas), atol=1e-12)
