@@ -57,10 +57,10 @@ def read_silhouette(path: Path, *, inverted: bool = False) -> SilhouetteFile:
     if inverted:
         mask = np.where(mask == UNKNOWN, mask, PERSON - mask).astype(np.uint8)
     person = mask == PERSON
-    share = person.mean()
+    share = float(person.mean())
     if share == 0:
         return SilhouetteFile(None, "silhouette is empty (no pixel is person)")
-    if share > 0.98:
+    if share > 0.999:
         return SilhouetteFile(None, f"silhouette covers the whole picture ({100 * share:.1f} % person)")
     return SilhouetteFile(mask, problem, looks_inverted=_border_share(person) > 0.5 and share > 0.5)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
@@ -24,6 +24,7 @@ class Silhouettes:
     problems: tuple[str, ...]
 
 
+@runtime_checkable
 class FrameSource(Protocol):
     """Where a recording's frames come from: image files or videos."""
 

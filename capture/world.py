@@ -58,7 +58,7 @@ def settle_world(
     if masks is not None and miss > 0.08 * distance:
         notes.append(
             "The rays through the silhouettes' middles miss each other by "
-            f"{100 * miss / distance:.0f} % of the distance: do folders and calibration files belong together?"
+            f"{100 * miss / distance:.0f} % of the distance: does the calibration belong to these folders?"
         )
     unit = _settle_unit(rig, masks, subject, declared_unit, units, where, notes)
     return World(unit, METRES_PER_UNIT[unit], _settle_up(rig, up, notes), tuple(notes))
@@ -125,20 +125,13 @@ def _check_facing(
 ) -> None:
     """Raise where cameras have the subject behind them: mirrored matrices, or poses given the wrong way
     round."""
-    inverted = Rig(tuple(_inverted(camera) for camera in rig))
-    other_subject, other_miss = find_subject(inverted, masks)
-    distance = float(np.median(np.linalg.norm(rig.centres - subject, axis=1)))
-    if (
-        masks is not None
-        and miss > 0.1 * distance
-        and other_miss < 0.25 * miss
-        and not _behind(inverted, other_subject)
-    ):
-        raise RecordingError(
-            f"{where}: the poses look inverted (camera-to-world given where world-to-camera is due): "
-            f"as they stand the silhouettes' rays miss each other by {100 * miss / distance:.0f} % "
-            "of the distance; invert every pose"
-        )
+    if not _is_plausible(rig, subject, miss):
+        inverted = Rig(tuple(_inverted(camera) for camera in rig))
+        if _is_plausible(inverted, *find_subject(inverted, masks)):
+            raise RecordingError(
+                f"{where}: the poses look inverted (camera-to-world given where world-to-camera is due): "
+                "the cameras see the subject from around it only with every pose inverted; invert them"
+            )
     behind = _behind(rig, subject)
     if not behind:
         return
@@ -158,6 +151,14 @@ def _check_facing(
         f"{where}: {len(behind)} of {len(rig)} cameras have the subject behind them ({names}): "
         f"their calibration is {kind}; calibrate them again or leave them out"
     )
+
+
+def _is_plausible(rig: Rig, subject: Float[np.ndarray, " 3"], miss: float) -> bool:
+    """Cameras around a subject: it is in front of all, their rays meet, and they do not stand in one
+    place."""
+    distance = float(np.median(np.linalg.norm(rig.centres - subject, axis=1)))
+    spread = float(np.linalg.norm(rig.centres - rig.centres.mean(axis=0), axis=1).max())
+    return not _behind(rig, subject) and miss < 0.08 * distance and (spread > 0.3 * distance or len(rig) < 2)
 
 
 def _behind(rig: Rig, subject: Float[np.ndarray, " 3"]) -> list[str]:

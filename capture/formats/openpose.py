@@ -120,8 +120,8 @@ def _read_people(path: Path) -> People:
     for values in flat:
         if values.shape != (3 * N_JOINTS,):
             raise RecordingError(
-                f"{path}: a person with {values.size} numbers, BODY_25 has {3 * N_JOINTS}; run OpenPose with its "
-                "BODY_25 model"
+                f"{path}: a person with {values.size} numbers, BODY_25 has {3 * N_JOINTS}; "
+                "run OpenPose with its BODY_25 model"
             )
         if not np.isfinite(values).all():
             raise RecordingError(f"{path}: a keypoint is not a finite number")
