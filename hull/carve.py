@@ -78,8 +78,8 @@ class Blocks:
 class _Front:
     """The cells still in question at one level, and what is known of them. Columns are cells.
 
-    Sets of cameras, as bits: `unasked` may still decide, `inside` see the whole cell inside, `hopeful` may see
-    some of it inside (so they hold the `inside` ones).
+    Sets of cameras, as bits: `unasked` may still decide, `inside` see all of the cell inside, `hopeful` may
+    see some of it inside (so they hold the `inside` ones).
     """
 
     cells: Int[np.ndarray, "3 n"]

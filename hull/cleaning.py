@@ -90,17 +90,20 @@ def vertex_normals(
 
     By angle and not by area, because marching cubes makes slivers beside large triangles.
     """
-    corners = vertices[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-    sums = np.zeros_like(vertices)
-    for k in range(3):
-        one = corners[:, (k + 1) % 3] - corners[:, k]
-        two = corners[:, (k + 2) % 3] - corners[:, k]
-        angle = np.arctan2(np.linalg.norm(np.cross(one, two), axis=1), np.einsum("fi,fi->f", one, two))
+    a, b, c = (vertices.T[:, faces[:, k]] for k in range(3))
+    ab, bc, ca = b - a, c - b, a - c
+    normal = np.stack(
+        [ab[1] * bc[2] - ab[2] * bc[1], ab[2] * bc[0] - ab[0] * bc[2], ab[0] * bc[1] - ab[1] * bc[0]]
+    )
+    # Twice the face's area: the sine's share of every corner's angle, whichever two edges meet there.
+    sine = np.sqrt((normal**2).sum(axis=0))
+    normal /= np.maximum(sine, 1e-30)
+    sums = np.zeros((3, len(vertices)))
+    for k, (one, two) in enumerate(((ab, ca), (bc, ab), (ca, bc))):
+        angle = np.arctan2(sine, -(one * two).sum(axis=0))
         for axis in range(3):
-            sums[:, axis] += np.bincount(faces[:, k], angle * normal[:, axis], minlength=len(vertices))
-    return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-30)
+            sums[axis] += np.bincount(faces[:, k], angle * normal[axis], minlength=len(vertices))
+    return np.ascontiguousarray((sums / np.maximum(np.sqrt((sums**2).sum(axis=0)), 1e-30)).T)
 
 
 def is_closed(faces: Int[np.ndarray, "f 3"], n_vertices: int) -> bool:

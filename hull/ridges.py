@@ -30,28 +30,27 @@ def raise_ridges(
     voxel_m: float,
 ) -> tuple[Float[np.ndarray, "v2 3"], Int[np.ndarray, "f2 3"]]:
     """Vertices (the given ones first) and faces with the deep edges split. `normals`: outward, unit."""
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    names, first, edge_of = np.unique(
-        ends.min(axis=1) * len(vertices) + ends.max(axis=1), return_index=True, return_inverse=True
-    )
-    a, b = ends[first].T
-    middle = 0.5 * (vertices[a] + vertices[b])
-    way = normals[a] + normals[b]
-    length = np.linalg.norm(way, axis=1)
-    way /= np.maximum(length, 1e-30)[:, None]
+    start, end = faces.T, faces[:, [1, 2, 0]].T
+    # On a closed surface every edge runs once in each direction: the rising ones name each edge once.
+    forth = (start < end).ravel()
+    names = np.minimum(start, end).ravel() * len(vertices) + np.maximum(start, end).ravel()
+    edges = np.sort(names[forth])
+    a, b = edges // len(vertices), edges % len(vertices)
+    way = normals.T[:, a] + normals.T[:, b]
+    length = np.sqrt((way**2).sum(axis=0))
     deep = np.flatnonzero(length > 0.5)
+    middle = 0.5 * (vertices.T[:, a[deep]] + vertices.T[:, b[deep]])
+    way = way[:, deep] / length[deep] * voxel_m
     for table in tables:
-        probe = middle[deep] + way[deep] * (_DEPTH_SPLIT * voxel_m)
-        deep = deep[table.ask_points(probe.T) != OUTSIDE]
-    if not len(deep):
-        return vertices, faces
-    reach = way[deep].T * (_FARTHEST * voxel_m)
-    exit_at, cut = exits(tables, middle[deep].T, reach)
-    deep, exit_at, reach = deep[cut], exit_at[cut], reach[:, cut]
-    new = middle[deep] + (reach * exit_at).T
-    number = np.full(len(names), -1)
+        still = table.ask_points(middle + _DEPTH_SPLIT * way) != OUTSIDE
+        deep, middle, way = deep[still], middle[:, still], way[:, still]
+    exit_at, cut = exits(tables, middle, _FARTHEST * way)
+    deep = deep[cut]
+    new = (middle + _FARTHEST * way * exit_at)[:, cut].T
+    number = np.full(len(edges), -1)
     number[deep] = len(vertices) + np.arange(len(deep))
-    return np.concatenate([vertices, new]), split_faces(faces, number[edge_of].reshape(3, -1).T)
+    split = number[np.searchsorted(edges, names)].reshape(3, -1).T
+    return np.concatenate([vertices, new]), split_faces(faces, split)
 
 
 def split_faces(faces: Int[np.ndarray, "f 3"], middle: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "f2 3"]:
