@@ -19,15 +19,14 @@ class RunConfig:
     """What to run on and how."""
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
-    """Folder of the recording: setup/camNN.txt with SilhouettesPictures/ (INRIA layout), or videos/ with a calibration file
-    and background plates."""
+    """Folder of the recording: setup/ and SilhouettesPictures/ (INRIA layout), or videos/ with calibration and plates."""
     out: Annotated[Path, tyro.conf.arg(metavar="RUN")]
     """Folder of the run; made if missing. Finished work in it is kept."""
-    sequence: str | None = None
+    sequence: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Which sequence, where the recording holds several."""
     body: str = "free:neutral"
     """Body model: free:neutral, free:female, free:male, or the path of an .npz file in SMPL's format."""
-    calibration: Path | None = None
+    calibration: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Calibration to use instead of the recording's own: a .qca.txt file, a rig.json, or a folder of camNN.txt."""
     frames: Annotated[str | None, tyro.conf.arg(metavar="START:STOP:STEP")] = None
     """Which frame numbers; all by default."""
@@ -37,9 +36,9 @@ class RunConfig:
     """Unit of the calibration's world."""
     up: Up = "auto"
     """World axis that points up."""
-    background: Path | None = None
+    background: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Folder of background plates, <camera>.png, for recordings of videos."""
-    keypoints: Path | None = None
+    keypoints: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Folder of OpenPose BODY_25 files, <camera>/<frame>.json, to start the pose from. Never needed."""
     overwrite: bool = False
     """Redo what this run folder already holds."""

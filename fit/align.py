@@ -6,7 +6,7 @@ in the unposed templates is cloth, with the motion factored out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -85,12 +85,29 @@ def align_sequence(
     scans: Iterable[tuple[int, Scan | None, Float[np.ndarray, "25 4"] | None]],
     settings: FitSettings,
     report: Callable[[Alignment], None] = lambda alignment: None,
+    done_before: Mapping[int, Alignment] | None = None,
 ) -> list[Alignment]:
     """Align the frames in order: (frame_id, scan in the body's frame or None, keypoints or None).
 
     Each frame starts from the previous pose; where that scores clearly worse than the best frame so far, or there is none,
-    the pose is found anew. A frame without a scan is passed over; one that raises is kept, marked "failed".
+    the pose is found anew. A frame without a scan is passed over; one that raises is kept, marked "failed". Frames of
+    `done_before` are taken as they are; `report` hears of the others.
     """
+    from threadpoolctl import threadpool_limits
+
+    # The matrices of pose finding are small: threads would only fight over them.
+    with threadpool_limits(limits=1, user_api="blas"):
+        return _align_in_order(fitter, finder, scans, settings, report, done_before or {})
+
+
+def _align_in_order(
+    fitter: Fitter,
+    finder: PoseFinder,
+    scans: Iterable[tuple[int, Scan | None, Float[np.ndarray, "25 4"] | None]],
+    settings: FitSettings,
+    report: Callable[[Alignment], None],
+    done_before: Mapping[int, Alignment],
+) -> list[Alignment]:
     done: list[Alignment] = []
     previous: CoarsePose | None = None
     centroid = np.zeros(3)
@@ -99,6 +116,16 @@ def align_sequence(
         if scan is None:
             continue
         coarse = CoarseScan.of(scan.points, scan.normals)
+        if frame_id in done_before:
+            alignment = done_before[frame_id]
+            done.append(alignment)
+            if alignment.status == "failed":
+                previous = None
+            else:
+                state = alignment.state
+                previous = CoarsePose(state.pose, state.translation, state.betas, alignment.score)
+                best_score, centroid = min(best_score, alignment.score), coarse.points.mean(0)
+            continue
         try:
             starts = starting_poses(finder, coarse, keypoints, previous, centroid, best_score)
             state = align_frame(fitter, finder, as_scan_points(scan), starts, settings)

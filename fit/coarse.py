@@ -21,6 +21,10 @@ from fit.closest import vertex_areas, vertex_normals
 NORMAL_WEIGHT_M = 0.08
 #: The score's cut-off: a point farther than this says nothing about how far.
 SCORE_CUT_M = 0.10
+#: Share of the point-to-point part beside the point-to-plane part, for pairs found from the body and from the scan.
+BODY_GLUE, SCAN_GLUE = 0.05, 0.4
+#: Radians that a joint may turn in one step.
+LARGEST_TURN = 0.6
 
 
 @dataclass(frozen=True)
@@ -41,9 +45,14 @@ class CoarseScan:
     normals: Float[np.ndarray, "n 3"]
     tree: cKDTree
 
+    @property
+    def stride(self) -> int:
+        """Every how-many-th point asks back for its nearest body point: about as many as the body has."""
+        return max(1, len(self.points) // 800)
+
     @staticmethod
-    def of(points: np.ndarray, normals: np.ndarray, n_points: int = 800) -> CoarseScan:
-        """An even subset of a scan: farthest-point order is dear, a strided subset of an area-uniform scan will do."""
+    def of(points: np.ndarray, normals: np.ndarray, n_points: int = 4000) -> CoarseScan:
+        """An even subset of an area-uniform scan: dense, so that a body point finds a scan point straight ahead of it."""
         keep = np.linspace(0, len(points) - 1, min(n_points, len(points))).astype(int)
         points, normals = points[keep], normals[keep]
         return CoarseScan(points, normals, cKDTree(np.hstack([points, NORMAL_WEIGHT_M * normals])))
@@ -121,8 +130,8 @@ class CoarseBody:
                 origin[j] = origin[parent] + world[parent] @ (joints[j] - joints[parent])
         offset = origin - np.einsum("jab,jb->ja", world, joints)
         # Where every bone alone would put every vertex, weighted: (n J 3).
-        by_bone = self.weights[:, :, None] * (np.einsum("jab,nb->nja", world, rest) + offset)
-        blended = np.einsum("nj,jab->nab", self.weights, world)
+        by_bone = self.weights[:, :, None] * ((rest @ world.reshape(-1, 3).T).reshape(len(rest), n_joints, 3) + offset)
+        blended = (self.weights @ world.reshape(n_joints, 9)).reshape(-1, 3, 3)
         normals = np.einsum("nab,nb->na", blended, self.rest_normals)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         return _Posed(by_bone.sum(1), normals, by_bone, blended, world, origin)
@@ -130,7 +139,7 @@ class CoarseBody:
     def jacobian(self, posed: _Posed) -> Float[np.ndarray, "n 3 p"]:
         """dv / d(rotation vectors in the parents' frames (3 J), translation (3), betas)."""
         n, n_joints = len(self.rest), len(self.parents)
-        moment = np.einsum("jk,nka->nja", self.descends, posed.by_bone)
+        moment = np.matmul(self.descends, posed.by_bone)
         share = self.weights @ self.descends.T
         arm = moment - share[:, :, None] * posed.origin
         parent_frame = np.stack([np.eye(3) if p < 0 else posed.world[p] for p in self.parents])
@@ -193,8 +202,8 @@ class CoarsePrior:
 
     mean: Float[np.ndarray, "m"]
     precision: Float[np.ndarray, "m m"]
-    pose_weight: float = 0.02
-    betas_weight: float = 0.2
+    pose_weight: float = 0.004
+    betas_weight: float = 0.01
 
 
 def score(body: CoarseBody, scan: CoarseScan, at: CoarsePose) -> float:
@@ -202,7 +211,7 @@ def score(body: CoarseBody, scan: CoarseScan, at: CoarsePose) -> float:
     posed = body.forward(at)
     own = np.hstack([posed.points[: body.n_surface], NORMAL_WEIGHT_M * posed.normals[: body.n_surface]])
     to_scan = scan.tree.query(own)[0]
-    to_body = cKDTree(own).query(np.hstack([scan.points, NORMAL_WEIGHT_M * scan.normals]))[0]
+    to_body = cKDTree(own).query(scan.tree.data[:: scan.stride])[0]
     return float(0.5 * (np.minimum(to_scan, SCORE_CUT_M).mean() + np.minimum(to_body, SCORE_CUT_M).mean()))
 
 
@@ -231,17 +240,19 @@ def refine(
             if scan is not None:
                 own = np.hstack([posed.points[:n], NORMAL_WEIGHT_M * posed.normals[:n]])
                 scan_idx = scan.tree.query(own)[1]
-                body_idx = cKDTree(own).query(np.hstack([scan.points, NORMAL_WEIGHT_M * scan.normals]))[1]
+                body_idx = cKDTree(own).query(scan.tree.data[:: scan.stride])[1]
                 vertex = np.concatenate([np.arange(n), body_idx])
-                point = np.concatenate([scan_idx, np.arange(len(scan.points))])
+                point = np.concatenate([scan_idx, np.arange(0, len(scan.points), scan.stride)])
                 gap = scan.points[point] - posed.points[vertex]
                 normal = scan.normals[point]
                 agree = (posed.normals[vertex] * normal).sum(1) > 0.0
                 weight = agree * (sigma**2 / (sigma**2 + (gap**2).sum(1))) ** 2
                 weight = weight / len(weight) * 700.0
-                # 0.7 along the normal, 0.3 in all directions.
+                # From the body to the scan mostly along the normal, since sampling noise along the surface acts like
+                # glue; from the scan to the body in all directions, since that is what pulls limbs to full length.
+                glue = np.repeat((BODY_GLUE, SCAN_GLUE), (n, len(body_idx)))[:, None, None]
                 metric = weight[:, None, None] * (
-                    0.7 * normal[:, :, None] * normal[:, None, :] + 0.3 * np.eye(3)
+                    (1 - glue) * normal[:, :, None] * normal[:, None, :] + glue * np.eye(3)
                 )
                 per_vertex = np.zeros((n, 3, 3))
                 np.add.at(per_vertex, vertex, metric)
@@ -267,16 +278,16 @@ def refine(
             betas = slice(3 * n_joints + 3, size)
             hessian[betas, betas] += prior.betas_weight * np.eye(body.n_betas)
             rhs[betas] -= prior.betas_weight * at.betas[: body.n_betas]
-            hessian[np.diag_indices(size)] += 0.05
+            hessian[np.diag_indices(size)] += 0.005
             step = cho_solve(cho_factor(hessian), rhs)
             turns = step[: 3 * n_joints].reshape(-1, 3)
-            largest = np.linalg.norm(turns, axis=1).max()
-            shorten = min(1.0, 0.6 / max(largest, 1e-12))
-            pose = (Rotation.from_rotvec(shorten * turns) * Rotation.from_rotvec(at.pose)).as_rotvec()
+            # A joint that hardly any point holds would swing wildly: it is held back alone, not the whole step.
+            turns /= np.maximum(1.0, np.linalg.norm(turns, axis=1, keepdims=True) / LARGEST_TURN)
+            pose = (Rotation.from_rotvec(turns) * Rotation.from_rotvec(at.pose)).as_rotvec()
             new_betas = at.betas.copy()
-            new_betas[: body.n_betas] += shorten * step[betas]
-            translation = at.translation + shorten * step[3 * n_joints : 3 * n_joints + 3]
-            moved = np.abs(shorten * step).max()
+            new_betas[: body.n_betas] += step[betas]
+            translation = at.translation + step[3 * n_joints : 3 * n_joints + 3]
+            moved = max(np.abs(turns).max(), np.abs(step[3 * n_joints :]).max())
             at = CoarsePose(pose, translation, new_betas)
             if moved < 2e-3:
                 break

@@ -7,21 +7,27 @@ a lost arm (folded onto the trunk) is nearly the only way to fail. The paper use
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from fit.body.model import BodyModel
-from fit.body.pose_prior import PosePrior
 from fit.coarse import CoarseBody, CoarsePose, CoarsePrior, CoarseScan, Targets, refine, score
+
+if TYPE_CHECKING:
+    from fit.body.pose_prior import PosePrior
 
 N_HEADINGS = 8
 KEPT = 3
-ARM_SEEDS = 8
+#: Arm configurations refined a side, out of all that arm_configurations() lists.
+REFINED_ARMS = 6
 #: SMPL joint numbers from collar to wrist.
 ARMS = ((13, 16, 18, 20), (14, 17, 19, 21))
 COARSE_TO_FINE_M = (0.3, 0.15, 0.08, 0.05)
+#: Facing ways this far apart, rad, are different hypotheses.
+OTHER_HEADING = 1.0
 #: A score this much worse than the best frame's means that the previous pose did not carry over.
 LOST = 1.10
 
@@ -32,19 +38,17 @@ class PoseFinder:
 
     body: CoarseBody
     prior: CoarsePrior
-    arm_seeds: Float[np.ndarray, "s j 3"]
+    arm_seeds: Float[np.ndarray, "2 s 4 3"]
     n_model_betas: int
 
     @staticmethod
-    def of(model: BodyModel, prior: PosePrior, seed: int = 0) -> PoseFinder:
-        """Build the coarse body and draw the arm configurations from the pose prior."""
-        precision = np.linalg.inv(prior.covariance)
-        samples = prior.sample(ARM_SEEDS, seed=seed)
-        n_joints = len(model.parents)
-        seeds = np.zeros((ARM_SEEDS, n_joints, 3))
-        seeds[:, 1:] = np.asarray(samples).reshape(ARM_SEEDS, n_joints - 1, 3)
+    def of(model: BodyModel, prior: PosePrior) -> PoseFinder:
+        """Build the coarse body; prior: over all joints but the root."""
         return PoseFinder(
-            CoarseBody.of(model), CoarsePrior(prior.mean, precision), seeds, model.shape_directions.shape[2]
+            CoarseBody.of(model),
+            CoarsePrior(prior.mean, np.linalg.inv(prior.covariance)),
+            arm_configurations(),
+            model.shape_directions.shape[2],
         )
 
     def mean_pose(self) -> Float[np.ndarray, "j 3"]:
@@ -64,26 +68,46 @@ class PoseFinder:
         centroid = scan.points.mean(0) - points.mean(0)
         return CoarsePose(pose, np.array([centroid[0], 0.5 * (shift[1] + scan_low[1] - low[1]), centroid[2]]), betas)
 
+    def standing_betas(self, scan: CoarseScan) -> Float[np.ndarray, "b"]:
+        """The first coefficient set so that the body in the mean pose is as high as the scan (within 3 deviations)."""
+
+        def height(first: float) -> float:
+            betas = np.zeros(self.n_model_betas)
+            betas[0] = first
+            points = self.body.forward(CoarsePose(self.mean_pose(), np.zeros(3), betas)).points
+            return float(np.ptp(points[: self.body.n_surface, 1]))
+
+        wanted, slope = float(np.ptp(scan.points[:, 1])), 0.5 * (height(1.0) - height(-1.0))
+        betas = np.zeros(self.n_model_betas)
+        betas[0] = np.clip((wanted - height(0.0)) / slope, -3.0, 3.0) if abs(slope) > 1e-3 else 0.0
+        return betas
+
     def from_hull(self, scan: CoarseScan, betas: np.ndarray | None = None) -> list[CoarsePose]:
-        """Hypotheses from the hull alone, best first."""
-        betas = np.zeros(self.n_model_betas) if betas is None else betas
-        tried = []
-        for k in range(N_HEADINGS):
-            start = self.facing(scan, 2.0 * np.pi * k / N_HEADINGS, betas)
-            tried.append(refine(self.body, scan, self.prior, start, COARSE_TO_FINE_M[:2], iterations=5))
-        tried = sorted(tried, key=lambda at: at.score)[:KEPT]
-        tried = [refine(self.body, scan, self.prior, at, COARSE_TO_FINE_M[2:]) for at in tried]
-        tried = sorted(tried, key=lambda at: at.score)
-        return sorted([self.reseed_arms(scan, at) for at in tried[:2]] + tried[2:], key=lambda at: at.score)
+        """Hypotheses from the hull alone, best first. betas: of the same person in another frame, if known."""
+        starts = [np.zeros(self.n_model_betas), self.standing_betas(scan)] if betas is None else [betas]
+        headings = 2.0 * np.pi * np.arange(N_HEADINGS) / N_HEADINGS
+        tried = [self.facing(scan, heading, first) for heading in headings for first in starts]
+        for sigma, iterations, kept in ((0.3, 6, 2 * KEPT), (0.15, 6, KEPT), (0.08, 6, KEPT), (0.05, 6, KEPT)):
+            tried = [refine(self.body, scan, self.prior, at, (sigma,), iterations) for at in tried]
+            tried = sorted(tried, key=lambda at: at.score)[:kept]
+        best = tried[0]
+        reseeded = [self.reseed_arms(scan, best)]
+        # The best of those that face another way has its arms tried too: it might be the true one with an arm lost.
+        others = [at for at in tried[1:] if heading_difference(at, best) > OTHER_HEADING]
+        reseeded += [self.reseed_arms(scan, at) for at in others[:1]]
+        return sorted(reseeded, key=lambda at: at.score)
 
     def reseed_arms(self, scan: CoarseScan, at: CoarsePose) -> CoarsePose:
         """Try other arm configurations, one side at a time; keep what scores best."""
-        for arm in ARMS:
-            best = at
-            for seed in self.arm_seeds:
+        for arm, seeds in zip(ARMS, self.arm_seeds, strict=True):
+            trials = []
+            for seed in seeds:
                 pose = at.pose.copy()
-                pose[list(arm)] = seed[list(arm)]
-                start = CoarsePose(pose, at.translation, at.betas)
+                pose[list(arm)] = seed
+                trial = CoarsePose(pose, at.translation, at.betas)
+                trials.append(CoarsePose(pose, at.translation, at.betas, self.score(scan, trial)))
+            best = at
+            for start in sorted(trials, key=lambda trial: trial.score)[:REFINED_ARMS]:
                 trial = refine(self.body, scan, self.prior, start, COARSE_TO_FINE_M[2:], iterations=4)
                 if trial.score < best.score:
                     best = trial
@@ -129,6 +153,36 @@ class PoseFinder:
     def score(self, scan: CoarseScan, at: CoarsePose) -> float:
         """Mean symmetric distance, m."""
         return score(self.body, scan, at)
+
+
+def arm_configurations() -> Float[np.ndarray, "2 s 4 3"]:
+    """Rotation vectors of collar, shoulder, elbow, wrist for the left and the right arm, over all that arms do.
+
+    Upper arms point in ten directions around the shoulder, with the elbow nearly straight; in five of them also bent. From
+    the T-pose, x to the body's left, y up, z to the front.
+    """
+    directions = {
+        "down": (0.15, -1.0, 0.05), "side": (1.0, 0.0, 0.0), "front": (0.1, -0.1, 1.0), "up": (0.25, 1.0, 0.0),
+        "up front": (0.3, 0.7, 0.7), "up side": (0.7, 0.7, 0.0), "down front": (0.2, -0.7, 0.7),
+        "down side": (0.7, -0.7, 0.1), "across": (-0.4, -0.2, 1.0), "down back": (0.3, -0.8, -0.5),
+    }  # fmt: skip
+    bent = ("down", "side", "front", "up side", "down front")
+    rows = []
+    for name, direction in directions.items():
+        to = np.asarray(direction) / np.linalg.norm(direction)
+        axis = np.cross([1.0, 0.0, 0.0], to)
+        length = np.linalg.norm(axis)
+        shoulder = axis / max(length, 1e-9) * np.arctan2(length, to[0])
+        for flexion in (0.3, 1.6) if name in bent else (0.3,):
+            rows.append([np.zeros(3), shoulder, np.array([0.0, -flexion, 0.0]), np.zeros(3)])
+    left = np.array(rows)
+    return np.stack([left, left * np.array([1.0, -1.0, -1.0])])
+
+
+def heading_difference(a: CoarsePose, b: CoarsePose) -> float:
+    """Angle between the directions that two bodies face, rad."""
+    front = [Rotation.from_rotvec(at.pose[0]).apply([0.0, 0.0, 1.0]) for at in (a, b)]
+    return float(np.arccos(np.clip(front[0] @ front[1], -1.0, 1.0)))
 
 
 def unwrap_root(pose: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "j 3"]:

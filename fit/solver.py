@@ -116,6 +116,12 @@ class Fitter:
         joints = self.joints(state.betas) if joints is None else joints
         return np.asarray(skin(self.arrays, state.template, joints, state.pose, state.translation))
 
+    def posed_joints(self, state: BodyState, joints: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "j 3"]:
+        """Where the joints of the zero pose go in this state."""
+        from fit.body.skinning import posed_joints
+
+        return np.asarray(posed_joints(self.arrays, joints, state.pose, state.translation))
+
     def linearised(
         self, state: BodyState, joints: Float[np.ndarray, "j 3"] | None
     ) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3 3"], Float[np.ndarray, "m p"]]:

@@ -1,0 +1,176 @@
+"""Stages capture and hull: silhouettes in, one visual hull a frame out, problems kept with their frame."""
+
+from __future__ import annotations
+
+import platform
+import sys
+import time
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from bodyhull import __version__
+from bodyhull.config import RunConfig
+from bodyhull.errors import UserError
+from bodyhull.folder import RunFolder, write_atomically
+from capture.recording import Recording, open_recording
+from hull.errors import HullError
+from hull.mesh_file import load_mesh, save_mesh
+from hull.quality import silhouette_agreement
+from hull.visual_hull import build_hull
+
+NOTED_PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless", "pycolmap", "scikit-image", "open3d", "jax", "pyrender")
+
+
+@dataclass(frozen=True)
+class CarvedFrame:
+    """What is known of a frame's hull: status "ok", "degraded" (a camera gave no evidence) or "failed"."""
+
+    frame_id: int
+    status: str
+    problems: tuple[str, ...]
+    agreement: tuple[float | None, ...] = ()
+    volume_m3: float | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        return {
+            "status": self.status,
+            "problems": list(self.problems),
+            "agreement": list(self.agreement),
+            "volume_m3": self.volume_m3,
+        }
+
+
+def open_for(config: RunConfig) -> Recording:
+    """Open the recording of a configuration."""
+    return open_recording(
+        config.recording,
+        sequence=config.sequence,
+        calibration=config.calibration,
+        frames=config.frames,
+        units=config.units,
+        up=config.up,
+        background=config.background,
+    )
+
+
+def software() -> dict[str, str]:
+    """Versions that a result depends on."""
+    found = {"bodyhull": __version__, "python": platform.python_version()}
+    for name in NOTED_PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "missing"
+    return found
+
+
+def claim(folder: RunFolder, config: RunConfig, fingerprint: str) -> dict[str, Any]:
+    """Bind the run folder to this input and these settings, or refuse where it holds another's work.
+
+    Returns the state of run.json. With --overwrite the earlier entries are dropped (the files are replaced one by one).
+    """
+    state = folder.read_state()
+    settings = config.carve_settings()
+    if state and not config.overwrite:
+        before = state.get("inputs", {}).get("fingerprint")
+        again = "add --overwrite to redo it, or choose another --out"
+        if before is not None and before != fingerprint:
+            raise UserError(
+                f"{folder.root}: made from another input (fingerprint {before[:12]}, the recording now has "
+                f"{fingerprint[:12]}); {again}"
+            )
+        old = {k: state.get("configuration", {}).get(k) for k in settings}
+        changed = [f"{k} was {old[k]!r}, now {v!r}" for k, v in settings.items() if old[k] != v]
+        if changed:
+            raise UserError(f"{folder.root}: made with other settings ({'; '.join(changed)}); {again}")
+        state["configuration"] = config.as_dict()
+    else:
+        state = {
+            "configuration": config.as_dict(),
+            "inputs": {"recording": str(config.recording.absolute()), "fingerprint": fingerprint},
+            "stages": {},
+        }
+    state["software"] = software()
+    folder.write_state(state)
+    return state
+
+
+def carve_stage(config: RunConfig) -> Recording:
+    """Open the recording, carve every frame that is not carved yet, and record how each went.
+
+    Raises UserError or RecordingError for what the user can cause; a frame that cannot be carved is marked "failed" and
+    never stops the others.
+    """
+    recording = open_for(config)
+    folder = RunFolder(config.out)
+    state = claim(folder, config, recording.fingerprint())
+    for note in recording.notes:
+        tqdm.write(f"note: {note}", file=sys.stderr)
+    write_atomically(folder.rig_file, recording.rig.save)
+    state["recording"] = {
+        "name": recording.name,
+        "unit": recording.unit,
+        "metres_per_unit": recording.metres_per_unit,
+        "up": recording.up.tolist(),
+        "frame_ids": list(recording.frame_ids),
+        "cameras": list(recording.rig.names),
+        "notes": list(recording.notes),
+    }
+    folder.write_state(state)
+    known: dict[str, Any] = {} if config.overwrite else state.get("stages", {}).get("hull", {}).get("frames", {})
+    frames = dict(known)
+    started = time.perf_counter()
+    todo = [k for k in recording.frame_ids if not _carved(folder, k, known)]
+    for frame_id in tqdm(todo, desc="carve", unit="frame", disable=not todo):
+        frames[f"{frame_id:06d}"] = carve_frame(recording, folder, frame_id, config.voxel_mm).as_dict()
+        folder.update_stage("hull", frames=frames)
+    if todo:
+        folder.update_stage("hull", seconds=round(time.perf_counter() - started, 2), carved=len(todo), frames=frames)
+    failed = [k for k in recording.frame_ids if frames[f"{k:06d}"]["status"] == "failed"]
+    if len(failed) == len(recording.frame_ids):
+        first = frames[f"{failed[0]:06d}"]["problems"]
+        raise UserError(f"no frame of {config.recording} could be carved; frame {failed[0]:06d}: {first[0]}")
+    return recording
+
+
+def _carved(folder: RunFolder, frame_id: int, known: dict[str, Any]) -> bool:
+    entry = known.get(f"{frame_id:06d}")
+    if entry is None:
+        return False
+    if entry["status"] == "failed":
+        return True
+    try:
+        return len(load_mesh(folder.hull(frame_id))[0]) > 0
+    except (OSError, ValueError):
+        return False
+
+
+def carve_frame(recording: Recording, folder: RunFolder, frame_id: int, voxel_mm: float) -> CarvedFrame:
+    """Carve one frame and write its hull; a frame that cannot be carved comes back marked."""
+    silhouettes = recording.silhouettes(frame_id)
+    for problem in silhouettes.problems:
+        tqdm.write(f"warning: {problem}", file=sys.stderr)
+    try:
+        hull = build_hull(recording.rig, silhouettes.images, voxel_m=voxel_mm / 1e3)
+    except HullError as error:
+        message = f"frame {frame_id:06d}: {error}"
+        tqdm.write(f"warning: {message}", file=sys.stderr)
+        folder.hull(frame_id).unlink(missing_ok=True)
+        return CarvedFrame(frame_id, "failed", (*silhouettes.problems, message))
+    agreement = silhouette_agreement(hull.vertices, hull.faces, recording.rig, silhouettes.images)
+    path = folder.hull(frame_id)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_mesh(path, hull.vertices, hull.faces, normals=hull.normals)
+    problems = (*silhouettes.problems, *hull.problems)
+    return CarvedFrame(
+        frame_id,
+        "degraded" if silhouettes.problems else "ok",
+        problems,
+        tuple(None if np.isnan(v) else round(float(v), 5) for v in agreement),
+        round(hull.volume_m3, 6),
+    )

@@ -1,0 +1,309 @@
+"""The command line: a thin skin over one configuration and one function a stage."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from bodyhull.config import RunConfig
+from bodyhull.errors import ERROR, FRAMES_FAILED, OK, UserError
+from bodyhull.folder import RunFolder
+
+RunArgument = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+
+
+@dataclass(frozen=True)
+class Run(RunConfig):
+    """The main job: a recording in, a body and overlay films out. Finished work is kept; run it again to resume."""
+
+
+@dataclass(frozen=True)
+class Carve(RunConfig):
+    """The first stages: silhouettes to one visual hull a frame."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Fit the body to the hulls of a run: cloth alignments, fusion shape, track."""
+
+    run: RunArgument
+    """Run folder with hulls."""
+    body: str | None = None
+    """Body model, if another than the run was made with: free:neutral, free:female, free:male, or a path."""
+    keypoints: Path | None = None
+    """Folder of OpenPose BODY_25 files, <camera>/<frame>.json, to start the pose from."""
+    overwrite: bool = False
+    """Replace the fit that the folder holds."""
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """Draw the overlay films and the report of a fitted run."""
+
+    run: RunArgument
+    """Run folder with a fit."""
+    overwrite: bool = False
+    """Draw films again that are there already."""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compare a fitted run with the true naked body, by the paper's measure and directly."""
+
+    run: RunArgument
+    """Run folder with a fit."""
+    truth: Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
+    """Folder that holds <sequence>.npz with the true vertices, or that file."""
+
+
+@dataclass(frozen=True)
+class Synth:
+    """Film a clothed synthetic person with a synthetic rig: a recording in the INRIA layout, with the truth."""
+
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    """Folder of the recording to make."""
+    cameras: int = 16
+    """How many cameras."""
+    size: Annotated[str, tyro.conf.arg(metavar="WxH")] = "1024x1024"
+    """Picture size in pixels."""
+    layout: Literal["dome", "ring", "cage"] = "dome"
+    """Where the cameras stand."""
+    frames: int = 24
+    """How many frames."""
+    motion: str = "tilt-twist"
+    """What the person does; an unknown name lists them all."""
+    garment: str = "tshirt-trousers"
+    """What the person wears; an unknown name lists them all."""
+    seed: int = 0
+    """Another number, another person."""
+    body: str = "free:neutral"
+    """Body model that the person is drawn from."""
+    overwrite: bool = False
+    """Replace a recording that is there already."""
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Look at this machine: Python, versions, off-screen OpenGL, cores, memory, GPU."""
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Film a clothed synthetic person, run everything on the recording, compare with the truth."""
+
+    out: Path = Path("demo")
+    """Folder for the recording and the run."""
+    seed: int = 7
+    """Another number, another person."""
+    motion: str = "tilt-twist"
+    """What the person does."""
+    garment: str = "tshirt-trousers"
+    """What the person wears."""
+
+
+Command = (
+    Annotated[Run, tyro.conf.subcommand("run")]
+    | Annotated[Synth, tyro.conf.subcommand("synth")]
+    | Annotated[Carve, tyro.conf.subcommand("carve")]
+    | Annotated[Fit, tyro.conf.subcommand("fit")]
+    | Annotated[Overlay, tyro.conf.subcommand("overlay")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
+    | Annotated[Demo, tyro.conf.subcommand("demo")]
+)
+
+
+def joined_signs(arguments: Sequence[str]) -> list[str]:
+    """`--up -y` and `--frames -10::` as one word each, so that their values are not taken for options."""
+    out: list[str] = []
+    for word in arguments:
+        if out and out[-1] in ("--up", "--frames") and word.startswith("-") and not word.startswith("--"):
+            out[-1] = f"{out[-1]}={word}"
+        else:
+            out.append(word)
+    return out
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of the `bodyhull` command; exits with 0, 1 (error), 2 (usage) or 3 (finished, but frames failed)."""
+    words = joined_signs(sys.argv[1:] if arguments is None else arguments)
+    command: Command = tyro.cli(  # type: ignore[call-overload]
+        Command,
+        prog="bodyhull",
+        description="From a calibrated multi-camera recording of a clothed person to the body under the clothes.",
+        args=words,
+        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
+    sys.exit(guarded(command))
+
+
+def guarded(command: object) -> int:
+    """Run a command; a user's mistake becomes one or two lines on standard error and exit code 1."""
+    from capture.errors import RecordingError
+    from fit.body.model import BodyModelError
+    from fit.truth import TruthError
+    from hull.errors import HullError
+    from hull.mesh_file import MeshFileError
+    from render.gl import GlError
+    from render.synthetic import SyntheticError
+
+    known = (UserError, RecordingError, HullError, MeshFileError, BodyModelError, TruthError, GlError, SyntheticError)
+    try:
+        return perform(command)
+    except known as error:
+        print(f"bodyhull: error: {error}", file=sys.stderr)
+        return ERROR
+    except KeyboardInterrupt:
+        print("bodyhull: stopped; what is finished is kept, run the same command to go on", file=sys.stderr)
+        return 130
+
+
+def perform(command: object) -> int:
+    """Dispatch; returns the exit code."""
+    match command:
+        case Run():
+            return run(RunConfig(**dataclasses.asdict(command)))
+        case Carve():
+            from bodyhull.carving import carve_stage
+
+            config = RunConfig(**dataclasses.asdict(command))
+            carve_stage(config)
+            return frames_code(config.out, "hull")
+        case Fit():
+            from bodyhull.fitting import fit_stage
+
+            config = configuration_of(command.run, command.overwrite, command.body, command.keypoints)
+            fit_stage(config)
+            return frames_code(command.run, "fit")
+        case Overlay():
+            from bodyhull.drawing import draw_stage
+
+            draw_stage(configuration_of(command.run, command.overwrite))
+            print(f"report: {RunFolder(command.run).report}")
+            return OK
+        case Evaluate():
+            return evaluate(command)
+        case Synth():
+            return synthesise(command)
+        case Doctor():
+            from bodyhull.doctor import findings, print_findings
+
+            return OK if print_findings(findings()) else ERROR
+        case Demo():
+            return demo(command)
+    raise AssertionError(f"no such command: {command!r}")
+
+
+def configuration_of(
+    root: Path, overwrite: bool = False, body: str | None = None, keypoints: Path | None = None
+) -> RunConfig:
+    """The configuration that a run folder was made with, with the changes asked for."""
+    folder = RunFolder(root)
+    state = folder.require_state()
+    config = dataclasses.replace(RunConfig.from_dict(state["configuration"]), out=root, overwrite=overwrite)
+    if body is not None:
+        config = dataclasses.replace(config, body=body)
+    if keypoints is not None:
+        config = dataclasses.replace(config, keypoints=keypoints)
+    if body is not None or keypoints is not None:
+        state["configuration"] = dataclasses.replace(config, overwrite=False).as_dict()
+        folder.write_state(state)
+    return config
+
+
+def frames_code(root: Path, stage: str) -> int:
+    """Exit code after a stage: 3 where frames failed, with a sentence that names them."""
+    frames = RunFolder(root).read_state().get("stages", {}).get(stage, {}).get("frames", {})
+    failed = sorted(k for k, entry in frames.items() if entry["status"] == "failed")
+    if not failed:
+        return OK
+    listed = ", ".join(failed[:8]) + (f" and {len(failed) - 8} more" if len(failed) > 8 else "")
+    print(f"bodyhull: {len(failed)} of {len(frames)} frames failed in stage {stage}: {listed}", file=sys.stderr)
+    return FRAMES_FAILED
+
+
+def run(config: RunConfig) -> int:
+    """All stages in order."""
+    from bodyhull.carving import carve_stage
+    from bodyhull.drawing import draw_stage
+    from bodyhull.fitting import fit_stage
+
+    started = time.perf_counter()
+    carve_stage(config)
+    fit_stage(config)
+    draw_stage(config)
+    folder = RunFolder(config.out)
+    films = sorted(folder.overlay("x").parent.glob("*.mp4"))
+    print(f"fusion shape: {folder.fusion_mesh}")
+    print(f"bodies:       {folder.mesh(0).parent}")
+    print(f"overlay:      {films[0] if films else '-'}" + (f" and {len(films) - 1} more" if len(films) > 1 else ""))
+    print(f"report:       {folder.report}   ({time.perf_counter() - started:.0f} s)")
+    return max(frames_code(config.out, "hull"), frames_code(config.out, "fit"))
+
+
+def evaluate(command: Evaluate) -> int:
+    """Compute, print and put into the report."""
+    from bodyhull.carving import open_for
+    from bodyhull.drawing import write_run_report
+    from bodyhull.evaluating import error_text, evaluate_stage
+    from bodyhull.fitting import load_track
+
+    config = configuration_of(command.run)
+    errors = evaluate_stage(config, command.truth)
+    folder = RunFolder(command.run)
+    if "render" in folder.read_state().get("stages", {}):
+        write_run_report(config, open_for(config), load_track(folder))
+    print(error_text(errors))
+    return OK
+
+
+def parsed_size(text: str) -> tuple[int, int]:
+    """ "1024x768" as (width, height)."""
+    try:
+        width, height = (int(part) for part in text.lower().split("x"))
+    except ValueError:
+        raise UserError(f"--size {text}: give WIDTHxHEIGHT in pixels, for example 1024x1024") from None
+    return width, height
+
+
+def synthesise(command: Synth) -> int:
+    """Film and tell where."""
+    from fit.body.model import load_body
+    from render.synthetic import film
+
+    truth = film(
+        command.out,
+        body=load_body(command.body),
+        n_cameras=command.cameras,
+        size=parsed_size(command.size),
+        layout=command.layout,
+        n_frames=command.frames,
+        motion=command.motion,
+        garment=command.garment,
+        seed=command.seed,
+        overwrite=command.overwrite,
+    )
+    print(f"recording: {command.out}\ntruth:     {truth}\nnext:      bodyhull run {command.out} --out RUN")
+    return OK
+
+
+def demo(command: Demo) -> int:
+    """The main job on a synthetic recording, then the comparison with the truth."""
+    recording, out = command.out / "recording", command.out / "run"
+    started = time.perf_counter()
+    synthesise(Synth(recording, frames=12, motion=command.motion, garment=command.garment, seed=command.seed, overwrite=True))
+    code = run(RunConfig(recording, out, overwrite=True))
+    if code != ERROR:
+        evaluate(Evaluate(out, recording / "truth"))
+    folder = RunFolder(out)
+    print(f"overlay film: {sorted(folder.overlay('x').parent.glob('*.mp4'))[0]}")
+    print(f"report:       {folder.report}")
+    print(f"whole demo:   {time.perf_counter() - started:.0f} s")
+    return code

@@ -1,0 +1,117 @@
+"""`bodyhull evaluate`: a run against the true naked body, in millimetres, by the paper's measure and directly."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from bodyhull.config import RunConfig
+from bodyhull.errors import UserError
+from bodyhull.fitting import load_fusion, load_track
+from bodyhull.folder import RunFolder, write_atomically
+from fit.body.model import load_body
+from fit.closest import vertex_areas
+from fit.evaluate import (
+    ErrorSummary,
+    Surface,
+    average,
+    inside_share,
+    pose_truth_to,
+    signed_error_mm,
+    summarise,
+    transfer_rig,
+)
+from fit.solver import Fitter
+from fit.state import BodyState
+from fit.truth import SCORED_REGIONS, load_truth
+from hull.mesh_file import load_mesh
+
+PROTOCOL = (
+    "Distance from true vertices to the result's surface: outer vertices of torso, arms, legs and neck, weighted by area, all "
+    "frames. 'paper': the true body is first re-posed to fit the result (Zhang et al. 2017, section 6.2); 'direct': as it stands in "
+    "that frame. Bias is positive where the result is too fat."
+)
+
+
+def evaluate_stage(config: RunConfig, truth_path: Path) -> dict[str, Any]:
+    """Compute all errors, write evaluate/errors.json, return them.
+
+    Raises UserError or TruthError where the run is not finished or the truth is not found.
+    """
+    folder = RunFolder(config.out)
+    state = folder.require_state()
+    track, fusion = load_track(folder), load_fusion(folder)
+    truth = load_truth(truth_path, state["recording"]["name"])
+    model = load_body(config.body)
+    if model.content_hash != str(track["body_hash"]):
+        raise UserError(
+            f"{folder.root}: was fitted with another version of body '{config.body}' "
+            f"({str(track['body_hash'])[:12]}, now {model.content_hash[:12]}); run: bodyhull fit {folder.root} --overwrite"
+        )
+    fitter = Fitter.of(model)
+    world_from_body = track["recording_from_body"]
+    rotation, shift = world_from_body[:3, :3], world_from_body[:3, 3]
+    scored, faces = truth.scored, track["faces"]
+    rows: dict[str, list[ErrorSummary]] = {}
+    parts: dict[str, list[ErrorSummary]] = {name: [] for name in SCORED_REGIONS}
+    outside, missing, used = [], [], 0
+
+    def note(name: str, vertices: np.ndarray, surface: Surface) -> np.ndarray:
+        error = signed_error_mm(vertices[scored], surface)
+        rows.setdefault(name, []).append(summarise(error, vertex_areas(vertices, truth.faces)[scored]))
+        return error
+
+    for k, frame_id in enumerate(tqdm(track["frame_ids"].tolist(), desc="evaluate", unit="frame")):
+        in_world = truth.frame(frame_id)
+        if in_world is None or track["status"][k] == "failed":
+            missing.append(frame_id)
+            continue
+        used += 1
+        true = (in_world - shift) @ rotation
+        hull_vertices, hull_faces = load_mesh(folder.hull(frame_id))
+        hull = Surface((hull_vertices - shift) @ rotation, hull_faces)
+        pose, translation = track["pose"][k], track["translation"][k]
+        detailed_state = BodyState(track["templates"][k], pose, translation, fusion.betas)
+        fusion_state = BodyState(fusion.template, pose, translation, fusion.betas)
+        detailed = Surface(fitter.posed(detailed_state, fusion.joints), faces)
+        fused = Surface(fitter.posed(fusion_state, fusion.joints), faces)
+        joints = fitter.posed_joints(detailed_state, fusion.joints)
+        note("hull, direct", true, hull)
+        for name, surface in (("fusion", fused), ("detailed", detailed)):
+            error = note(f"{name}, direct", true, surface)
+            if name == "detailed":
+                area = vertex_areas(true, truth.faces)
+                for part in SCORED_REGIONS:
+                    chosen = truth.region[scored] == part
+                    parts[part].append(summarise(error[chosen], area[scored][chosen]))
+            rig = transfer_rig(true, surface, model.weights, joints, model.parents)
+            note(f"{name}, paper", pose_truth_to(true, truth.faces, scored, rig, surface), surface)
+        outside.append(inside_share(detailed.vertices, hull))
+    if not used:
+        raise UserError(f"{truth_path}: the truth holds none of the run's fitted frames ({track['frame_ids'].tolist()})")
+    order = ("hull, direct", "fusion, direct", "detailed, direct", "fusion, paper", "detailed, paper")
+    errors: dict[str, Any] = {
+        "protocol": PROTOCOL,
+        "frames": used,
+        "frames_without_truth_or_fit": missing,
+        "summary": {name: asdict(average(rows[name])) for name in order},
+        "parts": {name: asdict(average([s for s in values if np.isfinite(s.rms)])) for name, values in parts.items()},
+        "detailed_rms_by_frame": [s.rms for s in rows["detailed, direct"]],
+        "body_outside_hull_share": float(np.mean(outside)),
+    }
+    write_atomically(folder.evaluation, lambda path: path.write_text(json.dumps(errors, indent=1) + "\n"))
+    return errors
+
+
+def error_text(errors: dict[str, Any]) -> str:
+    """The errors as a table for the terminal."""
+    lines = [f"{'error, mm':<26}{'RMS':>8}{'mean':>8}{'bias':>8}{'90 %':>8}"]
+    entries = [*errors["summary"].items(), *((f"detailed, direct: {k}", v) for k, v in errors["parts"].items())]
+    lines += [f"{name:<26}{e['rms']:8.2f}{e['mean']:8.2f}{e['bias']:+8.2f}{e['p90']:8.2f}" for name, e in entries]
+    lines.append(f"{'body outside the hull':<26}{100 * errors['body_outside_hull_share']:7.2f}% of its vertices (by more than 1 mm)")
+    return "\n".join(lines)

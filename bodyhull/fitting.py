@@ -1,0 +1,255 @@
+"""Stage fit: hulls in; alignments, fusion shape and track out, in the recording's world (paper sections 4.1 to 4.3).
+
+Finished frames are kept: an alignment on disk is used again as long as body, settings and hull are the same.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from bodyhull.config import RunConfig, digest
+from bodyhull.errors import UserError
+from bodyhull.folder import RunFolder, load_arrays, save_arrays
+from fit.align import Alignment, align_sequence
+from fit.body.model import BodyModel, load_body
+from fit.frames import apply, recording_from_body, scan_in_body_frame
+from fit.fuse import FusionShape, fuse
+from fit.initialise import PoseFinder
+from fit.settings import FitSettings
+from fit.solver import Fitter
+from fit.state import BodyState
+from fit.track import TrackedFrame, posed_vertices, track_sequence
+from hull.mesh_file import load_mesh, load_normals, save_mesh
+from hull.scan import Scan
+from hull.visual_hull import Hull
+
+
+def load_hull_scan(path: Path, n_points: int, seed: int) -> Scan:
+    """An all-cloth scan of the hull in a file, world frame."""
+    vertices, faces = load_mesh(path)
+    normals = load_normals(path)
+    assert normals is not None, f"{path} was written with normals"
+    hull = Hull(vertices, faces, normals, np.zeros(len(vertices), dtype=np.int64))
+    return Scan.from_hull(hull, n_points, seed)
+
+
+def fit_stage(config: RunConfig, settings: FitSettings | None = None) -> None:
+    """Fit the run's hulls. Raises UserError where there is none, or where another body's fit is in the folder."""
+    settings = FitSettings() if settings is None else settings
+    folder = RunFolder(config.out)
+    state = folder.require_state()
+    recording = state.get("recording")
+    hulls = state.get("stages", {}).get("hull", {}).get("frames", {})
+    if not recording or not hulls:
+        raise UserError(f"{folder.root}: there are no hulls to fit; run: bodyhull carve RECORDING --out {folder.root}")
+    frame_ids = [k for k in recording["frame_ids"] if hulls.get(f"{k:06d}", {}).get("status") in ("ok", "degraded")]
+    if not frame_ids:
+        raise UserError(f"{folder.root}: every frame's hull failed, so there is nothing to fit")
+
+    model = load_body(config.body)
+    settings_key = digest({"body": model.content_hash, **config.fit_settings(), "settings": asdict(settings)})
+    key = digest({"settings": settings_key, "hulls": {f: hulls[f]["volume_m3"] for f in sorted(hulls)}})
+    entry = state.get("stages", {}).get("fit", {})
+    if entry.get("key") == key and _finished(folder, frame_ids) and not config.overwrite:
+        return
+    if entry and entry.get("settings_key") != settings_key and not config.overwrite:
+        raise UserError(
+            f"{folder.root}: holds a fit of body '{entry.get('body')}' with other settings; "
+            "add --overwrite to replace it, or choose another --out"
+        )
+    started = time.perf_counter()
+    folder.update_stage(
+        "fit", key="", settings_key=settings_key, body=config.body, body_hash=model.content_hash, settings=asdict(settings)
+    )
+    fitter, finder = Fitter.of(model), _finder(model)
+    world_from_body = recording_from_body(np.asarray(recording["up"]))
+    scans = {
+        k: scan_in_body_frame(load_hull_scan(folder.hull(k), settings.n_points, settings.seed), world_from_body)
+        for k in tqdm(frame_ids, desc="read hulls", unit="frame", leave=False)
+    }
+    keypoints = _keypoints(config, frame_ids, world_from_body) if config.keypoints is not None else {}
+    alignments = _align(folder, fitter, finder, scans, keypoints, settings, settings_key, config.overwrite)
+    fusion = fuse(fitter, alignments, settings)
+    _save_fusion(folder, model, fusion)
+    with tqdm(total=len(alignments), desc="track", unit="frame") as bar:
+        track = track_sequence(fitter, finder, fusion, alignments, scans, settings, lambda frame: bar.update())
+    _save_track(folder, fitter, fusion, track, world_from_body)
+    for frame in track:
+        if frame.message:
+            tqdm.write(f"warning: {frame.message}", file=sys.stderr)
+    folder.update_stage(
+        "fit",
+        key=key,
+        seconds=round(time.perf_counter() - started, 2),
+        frames={
+            f"{f.frame_id:06d}": {
+                "status": f.status,
+                "problems": [f.message] if f.message else [],
+                "distance_mm": round(1e3 * f.distance_m, 3) if np.isfinite(f.distance_m) else None,
+            }
+            for f in track
+        },
+    )
+
+
+def _finder(model: BodyModel) -> PoseFinder:
+    from fit.body.pose_prior import PosePrior
+
+    return PoseFinder.of(model, PosePrior.standard())
+
+
+def _finished(folder: RunFolder, frame_ids: list[int]) -> bool:
+    track = load_arrays(folder.track)
+    return (
+        track is not None
+        and load_arrays(folder.fusion) is not None
+        and set(frame_ids) == set(track["frame_ids"].tolist())
+        and all(
+            folder.mesh(k).is_file() or status == "failed"
+            for k, status in zip(track["frame_ids"].tolist(), track["status"].tolist(), strict=True)
+        )
+    )
+
+
+def _keypoints(config: RunConfig, frame_ids: list[int], world_from_body: np.ndarray) -> dict[int, np.ndarray]:
+    """Triangulated keypoints a frame, in the body's frame."""
+    from bodyhull.carving import open_for
+    from capture.keypoints import read_keypoints, triangulate_keypoints
+
+    recording = open_for(config)
+    assert config.keypoints is not None
+    out = {}
+    for frame_id in tqdm(frame_ids, desc="keypoints", unit="frame", leave=False):
+        detections = read_keypoints(config.keypoints, recording.rig.names, frame_id)
+        silhouettes = recording.silhouettes(frame_id)
+        points = triangulate_keypoints(recording.calibration, detections, silhouettes.images)
+        points[:, :3] = points[:, :3] @ world_from_body[:3, :3]
+        out[frame_id] = points
+    return out
+
+
+def _align(
+    folder: RunFolder,
+    fitter: Fitter,
+    finder: PoseFinder,
+    scans: dict[int, Scan],
+    keypoints: dict[int, np.ndarray],
+    settings: FitSettings,
+    settings_key: str,
+    overwrite: bool,
+) -> list[Alignment]:
+    """Alignments from disk where they are still valid, the rest made and written one by one."""
+    prints = {k: digest([settings_key, float(s.points.sum()), float(np.abs(s.points).sum())]) for k, s in scans.items()}
+    done: dict[int, Alignment] = {}
+    if not overwrite:
+        for k in scans:
+            found = _load_alignment(folder.alignment(k), prints[k])
+            if found is not None:
+                done[k] = found
+    if done:
+        tqdm.write(f"align: {len(done)} of {len(scans)} frames are done already", file=sys.stderr)
+    with tqdm(total=len(scans), initial=len(done), desc="align", unit="frame") as bar:
+
+        def keep(alignment: Alignment) -> None:
+            _save_alignment(folder.alignment(alignment.frame_id), alignment, prints[alignment.frame_id])
+            bar.update()
+
+        frames = [(k, scan, keypoints.get(k)) for k, scan in scans.items()]
+        return align_sequence(fitter, finder, frames, settings, keep, done)
+
+
+def _state_arrays(state: BodyState) -> dict[str, np.ndarray]:
+    return {"template": state.template, "pose": state.pose, "translation": state.translation, "betas": state.betas}
+
+
+def _save_alignment(path: Path, alignment: Alignment, fingerprint: str) -> None:
+    save_arrays(
+        path,
+        **_state_arrays(alignment.state),
+        frame_id=alignment.frame_id,
+        score=alignment.score,
+        distance_m=alignment.distance_m,
+        status=alignment.status,
+        message=alignment.message,
+        fingerprint=fingerprint,
+    )
+
+
+def _load_alignment(path: Path, fingerprint: str) -> Alignment | None:
+    found = load_arrays(path)
+    if found is None or str(found.get("fingerprint")) != fingerprint:
+        return None
+    state = BodyState(found["template"], found["pose"], found["translation"], found["betas"])
+    return Alignment(
+        int(found["frame_id"]),
+        state,
+        float(found["score"]),
+        float(found["distance_m"]),
+        str(found["status"]),
+        str(found["message"]),
+    )
+
+
+def _save_fusion(folder: RunFolder, model: BodyModel, fusion: FusionShape) -> None:
+    save_arrays(
+        folder.fusion,
+        template=fusion.template,
+        betas=fusion.betas,
+        joints=fusion.joints,
+        spread=fusion.spread,
+        faces=model.faces,
+        body=model.name,
+        body_hash=model.content_hash,
+    )
+    save_mesh(folder.fusion_mesh, fusion.template, model.faces)
+
+
+def load_fusion(folder: RunFolder) -> FusionShape:
+    """The fusion shape of a finished fit."""
+    found = load_arrays(folder.fusion)
+    if found is None:
+        raise UserError(f"{folder.fusion}: missing or damaged; run: bodyhull fit {folder.root}")
+    return FusionShape(found["template"], found["betas"], found["joints"], found["spread"])
+
+
+def _save_track(
+    folder: RunFolder, fitter: Fitter, fusion: FusionShape, track: list[TrackedFrame], world_from_body: np.ndarray
+) -> None:
+    for frame in track:
+        path = folder.mesh(frame.frame_id)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if frame.status == "failed":
+            path.unlink(missing_ok=True)
+            continue
+        save_mesh(path, apply(world_from_body, posed_vertices(fitter, fusion, frame)), fitter.model.faces)
+    save_arrays(
+        folder.track,
+        frame_ids=np.array([f.frame_id for f in track]),
+        pose=np.stack([f.state.pose for f in track]),
+        translation=np.stack([f.state.translation for f in track]),
+        betas=fusion.betas,
+        joints=fusion.joints,
+        templates=np.stack([f.state.template for f in track]),
+        status=np.array([f.status for f in track]),
+        message=np.array([f.message for f in track]),
+        distance_m=np.array([f.distance_m for f in track]),
+        recording_from_body=world_from_body,
+        faces=fitter.model.faces,
+        body=fitter.model.name,
+        body_hash=fitter.model.content_hash,
+    )
+
+
+def load_track(folder: RunFolder) -> dict[str, Any]:
+    """Arrays of track.npz."""
+    found = load_arrays(folder.track)
+    if found is None:
+        raise UserError(f"{folder.track}: missing or damaged; run: bodyhull fit {folder.root}")
+    return found
