@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from fit.body import BodyModel
-from fit.body.parts import region_mask, region_of_vertices
+from fit.body.parts import REGIONS, region_mask, region_of_vertices
 from fit.body.skeleton import JOINT, axis_angle_to_matrix, blend_linearly, world_from_rest
 
 from .garments import Garment, Landmarks, cut_out, drape
@@ -161,7 +161,8 @@ def _detail(
     waves /= np.linalg.norm(waves, axis=1, keepdims=True) * rng.uniform(0.12, 0.40, (40, 1))
     phase, size = rng.uniform(0, 2 * np.pi, 40), rng.standard_normal(40)
     height = np.sin(2 * np.pi * (shaped @ waves.T) + phase) @ size
-    height *= np.where(region_mask(body.parts, "hand", "foot", "head"), 0.25, 1.0)
+    extremities = [JOINT[name] for region in ("hand", "foot", "head") for name in REGIONS[region]]
+    height *= 1.0 - 0.75 * body.weights[:, extremities].sum(1)
     detail = height[:, None] * vertex_normals(shaped, body.faces)
     space = body.shape_directions.reshape(-1, body.n_betas)
     # normal equations: the components are independent, and a least-squares routine takes ten times as long

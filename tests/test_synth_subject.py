@@ -42,10 +42,10 @@ def test_the_detail_is_outside_of_the_shape_space_and_as_large_as_asked(body: Bo
     assert size[trunk].mean() == pytest.approx(0.003)
     assert size.max() < 0.02
     assert size[region_mask(body.parts, "hand", "foot", "head")].mean() < 0.002
-    # smooth: along an edge, two centimetres, the height over the skin changes little
+    # smooth: along an edge (two centimetres) the height over the skin changes little; noise would give 1.4
     height = (detail * vertex_normals(body.shaped(subject.betas), body.faces)).sum(1)
     a, b = body.faces[:, 0], body.faces[:, 1]
-    assert np.abs(height[a] - height[b]).mean() < 0.4 * np.abs(height).mean()
+    assert np.abs(height[a] - height[b]).mean() < 0.5 * np.abs(height).mean()
 
 
 def test_no_detail_where_none_is_wanted(body: BodyModel) -> None:
