@@ -34,8 +34,8 @@ _STEADY_SHARE = 0.85
 _N_FREE_FRAMES = 4
 _N_FREE_FRAMES_GHOST = 2
 
-Picture = UInt8[np.ndarray, "h w 3"]
-Samples = UInt8[np.ndarray, "t h w 3"]
+Picture = UInt8[np.ndarray, "_h _w 3"]
+Samples = UInt8[np.ndarray, "_t _h _w 3"]
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,12 @@ class Backgrounds:
     """
 
     pictures: tuple[Picture, ...]
-    trusted: tuple[Bool[np.ndarray, "h w"], ...]
+    trusted: tuple[Bool[np.ndarray, "_h _w"], ...]
     small: tuple[Picture, ...]
     finder: RegionFinder
     scale: float
 
-    def outlines(self, pictures: list[Picture | None]) -> list[Bool[np.ndarray, "h w"] | None]:
+    def outlines(self, pictures: list[Picture | None]) -> list[Bool[np.ndarray, "_h _w"] | None]:
         """Where the subject can be in one frame's full-size pictures: one (h w) mask a camera at full size.
 
         The largest part of the widened hull; None for a camera without a picture, or where there is no hull
@@ -67,7 +67,7 @@ class Backgrounds:
             else:
                 foregrounds.append(foreground(shrunk(picture, self.scale), small))
         voxels = self.finder.parts(foregrounds) == 1
-        result: list[Bool[np.ndarray, "h w"] | None] = []
+        result: list[Bool[np.ndarray, "_h _w"] | None] = []
         for camera_idx, picture in enumerate(pictures):
             if picture is None or not voxels.any():
                 result.append(None)
@@ -136,7 +136,7 @@ def _enlarged(
     return cv2.resize(image, shape[1::-1], interpolation=cv2.INTER_LINEAR)
 
 
-def _box_at_full_size(mask: Shaped[np.ndarray, "h w"], shape: tuple[int, ...]) -> tuple[slice, slice]:
+def _box_at_full_size(mask: Shaped[np.ndarray, "_h _w"], shape: tuple[int, ...]) -> tuple[slice, slice]:
     """Rows and columns of the full-size picture around a smaller mask's set pixels, with a margin of 5 %."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     slices = []
@@ -173,21 +173,21 @@ def _subject_outlines(
     finder: RegionFinder,
     samples: list[Samples],
     small: list[Picture],
-    ghosts: list[Bool[np.ndarray, "h w"]],
-) -> list[Bool[np.ndarray, "t h w"]]:
+    ghosts: list[Bool[np.ndarray, "_h _w"]],
+) -> list[Bool[np.ndarray, "_t _h _w"]]:
     """Per camera, (T h w) at the finder's scale: where the subject can be in each sample.
 
     Where a ghost stands on the plate, this camera's own foreground is worthless: there the other cameras
     alone say where the subject is, and with less widening, because the plate cannot be fallen back on.
     """
-    outlines: list[list[Bool[np.ndarray, "h w"]]] = [[] for _ in samples]
+    outlines: list[list[Bool[np.ndarray, "_h _w"]]] = [[] for _ in samples]
     for time_idx in range(len(samples[0])):
         frame = [foreground(s[time_idx], b) for s, b in zip(samples, small, strict=True)]
         voxels = finder.parts(frame) == 1
         for camera_idx, ghost in enumerate(ghosts):
             outline = finder.outline(camera_idx, voxels)
             if ghost.any() and len(frame) > 2:
-                others: list[UInt8[np.ndarray, "h w"] | None] = [*frame]
+                others: list[UInt8[np.ndarray, "_h _w"] | None] = [*frame]
                 others[camera_idx] = None
                 seen_by_others = finder.parts(others, widen=0.4)
                 hit = np.bincount(seen_by_others[voxels], minlength=1)
@@ -200,9 +200,9 @@ def _subject_outlines(
 
 def _look_behind_ghost(
     samples: Samples,
-    outlines: Bool[np.ndarray, "t h w"],
-    ghost: Bool[np.ndarray, "h w"],
-    patched: Bool[np.ndarray, "h w"],
+    outlines: Bool[np.ndarray, "_t _h _w"],
+    ghost: Bool[np.ndarray, "_h _w"],
+    patched: Bool[np.ndarray, "_h _w"],
     background: Picture,
 ) -> None:
     """Narrow `outlines` and complete `background` (both in place) where the subject always may stand before
@@ -224,7 +224,7 @@ def _look_behind_ghost(
 
 def _find_ghosts(
     finder: RegionFinder, samples: list[Samples], steady: list[Picture], small: list[Picture]
-) -> tuple[list[Bool[np.ndarray, "h w"]], list[Bool[np.ndarray, "h w"]]]:
+) -> tuple[list[Bool[np.ndarray, "_h _w"]], list[Bool[np.ndarray, "_h _w"]]]:
     """Ghosts, per camera at the finder's scale: (patches, zones), both (h w).
 
     A part of the hull is a ghost if almost nothing moves in it in most cameras while the subject, the part
@@ -265,8 +265,8 @@ def _moving_shares(
     finder: RegionFinder,
     labels: Int[np.ndarray, " v"],
     camera_idx: int,
-    frame: UInt8[np.ndarray, "h w"],
-    steady_share: Float[np.ndarray, "h w"],
+    frame: UInt8[np.ndarray, "_h _w"],
+    steady_share: Float[np.ndarray, "_h _w"],
 ) -> list[float]:
     """For each part of the hull: how much of its foreground in this camera is unsteady over time; NaN: not
     seen."""
@@ -278,8 +278,8 @@ def _moving_shares(
 
 
 def _over_free_frames(
-    samples: Samples, outlines: Bool[np.ndarray, "t h w"], ghosts: Bool[np.ndarray, "h w"]
-) -> tuple[Picture, Bool[np.ndarray, "h w"]]:
+    samples: Samples, outlines: Bool[np.ndarray, "_t _h _w"], ghosts: Bool[np.ndarray, "_h _w"]
+) -> tuple[Picture, Bool[np.ndarray, "_h _w"]]:
     """The median of each pixel over the samples whose outline it lies outside of, and where there were
     enough of them.
 

@@ -27,8 +27,8 @@ _LEAST_JOINTS = 6
 _AGREEMENT_RAD = 0.035  # two degrees: a calibration one degree off and OpenPose's own noise pass
 _LEAST_ANGLE_DEG = 3.0
 
-People = Float[np.ndarray, "p 25 3"]
-Silhouette = UInt8[np.ndarray, "h w"]
+People = Float[np.ndarray, "_p 25 3"]
+Silhouette = UInt8[np.ndarray, "_h _w"]
 
 
 def triangulate_keypoints(

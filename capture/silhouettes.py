@@ -20,7 +20,8 @@ class Silhouettes:
     """
 
     frame_id: int
-    images: tuple[UInt8[np.ndarray, "h w"] | None, ...]
+    # The leading underscores: cameras may differ in size, so the names bind nothing across the tuple.
+    images: tuple[UInt8[np.ndarray, "_h _w"] | None, ...]
     problems: tuple[str, ...]
 
 

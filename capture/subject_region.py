@@ -63,7 +63,7 @@ class RegionFinder:
         return RegionFinder((shape[0], shape[1], shape[2]), tuple(pixels), tuple(visible), tuple(sizes))
 
     def parts(
-        self, foregrounds: Sequence[UInt8[np.ndarray, "h w"] | None], widen: float = 1.0
+        self, foregrounds: Sequence[UInt8[np.ndarray, "_h _w"] | None], widen: float = 1.0
     ) -> Int[np.ndarray, " v"]:
         """The widened hull's connected parts: a label a voxel (V,), 0 outside, 1, 2, ... by falling size.
 

@@ -22,7 +22,7 @@ METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 UP_AXES = dict(zip(("x", "y", "z", "-x", "-y", "-z"), [*np.eye(3), *-np.eye(3)], strict=True))
 _PERSON_M = 1.7
 
-Masks = Sequence[UInt8[np.ndarray, "h w"] | None]
+Masks = Sequence[UInt8[np.ndarray, "_h _w"] | None]
 
 
 @dataclass(frozen=True)

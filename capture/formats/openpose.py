@@ -28,7 +28,7 @@ _FROM_25B = (
     (2,), (1,), (4,), (3,), (19,), (20,), (21,), (22,), (23,), (24,),
 )  # fmt: skip
 
-People = Float[np.ndarray, "p 25 3"]
+People = Float[np.ndarray, "_p 25 3"]
 
 
 def read_keypoints(folder: Path | str, camera_names: Sequence[str], frame_id: int) -> list[People]:
