@@ -16,7 +16,7 @@ frames, the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -45,28 +45,32 @@ class Backgrounds:
     pictures : one a camera, (h w 3) uint8 in the channel order of the samples.
     trusted : one a camera, (h w): False where a ghost stands on the plate and the video never shows what is
     behind.
-    finder, small : the region finder, and the backgrounds at its scale.
+    finder : the region finder; small, steady : at its scale, the backgrounds and the videos' medians over
+    time.
     """
 
     pictures: tuple[Picture, ...]
     trusted: tuple[Bool[np.ndarray, "_h _w"], ...]
     small: tuple[Picture, ...]
+    steady: tuple[Picture, ...]
     finder: RegionFinder
     scale: float
 
     def outlines(self, pictures: list[Picture | None]) -> list[Bool[np.ndarray, "_h _w"] | None]:
         """Where the subject can be in one frame's full-size pictures: one (h w) mask a camera at full size.
 
-        The largest part of the widened hull; None for a camera without a picture, or where there is no hull
-        at all.
+        The part of the widened hull that moves most; None for a camera without a picture, or where there is
+        no hull at all.
         """
-        foregrounds = []
-        for picture, small in zip(pictures, self.small, strict=True):
-            if picture is None:  # no evidence: everything may be foreground
-                foregrounds.append(np.full(small.shape[:2], 255, np.uint8))
+        frame, now = [], []
+        for picture, small, steady in zip(pictures, self.small, self.steady, strict=True):
+            if picture is None:  # no evidence: everything may be foreground, nothing moves
+                frame.append(np.full(small.shape[:2], 255, np.uint8))
+                now.append(steady)
             else:
-                foregrounds.append(foreground(shrunk(picture, self.scale), small))
-        voxels = self.finder.parts(foregrounds) == 1
+                now.append(shrunk(picture, self.scale))
+                frame.append(foreground(now[-1], small))
+        voxels = _subject_voxels(self.finder, frame, now, self.steady)
         result: list[Bool[np.ndarray, "_h _w"] | None] = []
         for camera_idx, picture in enumerate(pictures):
             if picture is None or not voxels.any():
@@ -96,7 +100,7 @@ def build_backgrounds(
         picture[patch] = middle[patch]
     # Twice: with better backgrounds the outlines are tighter, and more pixels are free in more frames.
     for _ in range(2):
-        outlines = _subject_outlines(finder, samples, small, ghosts)
+        outlines = _subject_outlines(finder, samples, steady, small, ghosts)
         for camera_idx, stack in enumerate(samples):
             middle, free = _over_free_frames(stack, outlines[camera_idx], ghosts[camera_idx])
             small[camera_idx][free] = middle[free]
@@ -123,7 +127,7 @@ def build_backgrounds(
         known[box] |= free | patch
         pictures.append(picture)
         trusted.append(known)
-    return Backgrounds(tuple(pictures), tuple(trusted), tuple(small), finder, scale)
+    return Backgrounds(tuple(pictures), tuple(trusted), tuple(small), tuple(steady), finder, scale)
 
 
 def _enlarged(
@@ -169,9 +173,36 @@ def median_over_time(samples: Samples) -> Picture:
     return result
 
 
+def _subject_voxels(
+    finder: RegionFinder,
+    frame: list[UInt8[np.ndarray, "_h _w"]],
+    now: Sequence[Picture],
+    steady: Sequence[Picture],
+) -> Bool[np.ndarray, " v"]:
+    """The hull's part (V,) in which most has moved away from the videos' median, counted in pixels over all
+    cameras.
+
+    A ghost can be as large as the subject, but nothing moves in it. What is foreground without moving counts
+    a little, so that a subject who never moves is found by size.
+    """
+    labels = finder.parts(frame)
+    n_parts = int(labels.max())
+    if n_parts < 2:
+        return labels == 1
+    weight = [
+        np.where(f > 0, 0.02 + (departure(p, s) > CLEAR_LEVELS), 0.0)
+        for f, p, s in zip(frame, now, steady, strict=True)
+    ]
+    score = np.zeros(n_parts + 1)
+    for part in range(1, n_parts + 1):
+        score[part] = sum(float(w[finder.outline(idx, labels == part)].sum()) for idx, w in enumerate(weight))
+    return labels == int(score.argmax())
+
+
 def _subject_outlines(
     finder: RegionFinder,
     samples: list[Samples],
+    steady: list[Picture],
     small: list[Picture],
     ghosts: list[Bool[np.ndarray, "_h _w"]],
 ) -> list[Bool[np.ndarray, "_t _h _w"]]:
@@ -183,7 +214,8 @@ def _subject_outlines(
     outlines: list[list[Bool[np.ndarray, "_h _w"]]] = [[] for _ in samples]
     for time_idx in range(len(samples[0])):
         frame = [foreground(s[time_idx], b) for s, b in zip(samples, small, strict=True)]
-        voxels = finder.parts(frame) == 1
+        now = [stack[time_idx] for stack in samples]
+        voxels = _subject_voxels(finder, frame, now, steady)
         for camera_idx, ghost in enumerate(ghosts):
             outline = finder.outline(camera_idx, voxels)
             if ghost.any() and len(frame) > 2:
@@ -217,7 +249,7 @@ def _look_behind_ghost(
             return
         for time_idx, picture in enumerate(samples):
             person = segment_small(picture, background, outlines[time_idx], known)
-            outlines[time_idx] &= grown(person, 5) | ~ghost
+            outlines[time_idx] &= grown(person, 5.0) | ~ghost
         middle, free = _over_free_frames(samples, outlines, ghost)
         background[free] = middle[free]
 
@@ -258,7 +290,7 @@ def _find_ghosts(
                 zones[camera_idx] |= where & (nearest[camera_idx] > CLEAR_LEVELS // 2)
                 differs = departure(steady[camera_idx], small[camera_idx]) > CLEAR_LEVELS // 2
                 patches[camera_idx] |= where & differs & (share[camera_idx] >= _STEADY_SHARE)
-    return patches, [grown(zone, 3) for zone in zones]
+    return patches, [grown(zone, 3.0) for zone in zones]
 
 
 def _moving_shares(
