@@ -1,5 +1,4 @@
-"""The one place where JAX is configured: double precision and a compilation cache that outlives the process.
-"""
+"""The one place where JAX is configured: double precision and a compilation cache that is kept."""
 
 from functools import cache
 from pathlib import Path

@@ -43,7 +43,7 @@ DECIMALS = 9  # of the stored arrays: a nanometre, so that a last bit of some BL
 LICENCE = "CC0-1.0"
 GENERATOR = (
     "ansur2.json", "anatomy.py", "anthropometry.py", "build.py", "correctives.py", "correspondence.py",
-    "half_mesh.py", "implicit.py", "joint_regressor.py", "model.py", "parts.py", "remesh.py",
+    "half_mesh.py", "implicit.py", "joint_regressor.py", "parts.py", "remesh.py",
     "shape_space.py", "skeleton.py", "skin_weights.py", "stations.py",
 )  # fmt: skip
 

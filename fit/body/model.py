@@ -7,7 +7,6 @@ with SMPL's arrays under SMPL's key names. Plain numpy: nothing here starts JAX.
 
 import hashlib
 import os
-import tempfile
 import zipfile
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -140,9 +139,10 @@ class BodyModel:
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         parents = np.where(self.parents < 0, 2**32 - 1, self.parents).astype(np.uint32)  # as SMPL's files do
-        handle, temporary = tempfile.mkstemp(suffix=".npz", prefix=path.stem, dir=path.parent)
+        # The process number keeps two writers apart; an ordinary open keeps the user's file permissions.
+        temporary = path.with_name(f".{path.name}.{os.getpid()}")
         try:
-            with os.fdopen(handle, "wb") as stream:
+            with temporary.open("wb") as stream:
                 np.savez_compressed(
                     stream,
                     v_template=self.template,
@@ -160,9 +160,9 @@ class BodyModel:
                     landmarks=self.landmarks,
                     n_anthropometric=np.array(self.n_anthropometric),
                 )
-            Path(temporary).replace(path)
+            temporary.replace(path)
         except BaseException:
-            Path(temporary).unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
             raise
 
     @staticmethod

@@ -1,18 +1,17 @@
 """What poses people take: a Gaussian over the 23 joint rotations, built from published ranges of motion.
 
-Ranges are the clinical ones (American Academy of Orthopaedic Surgeons, in Greene & Heckman 1994; Boone & Azen
-1979; Soucie et al. 2011 for elbow, knee and ankle; White & Panjabi 1990 for the spine, shared out over the
-model's joints). Means and standard deviations are ours: a relaxed stance with hanging arms, spread so that
-the usual motions of a standing person lie within two standard deviations and the end of a range near two and
-a half. Knees and elbows bend one way only: their means lie half a bend away from straight, and samples are
-cut at the range.
+Ranges are round figures of the usual clinical tables (those of the American Academy of Orthopaedic Surgeons and
+Boone & Azen 1979 are the common sources; hips, knees, ankles, elbows and wrists were compared with secondary
+tables, the originals were not consulted). How trunk and neck share theirs among the model's joints is ours, and
+so are means, standard deviations and couplings: a relaxed stance with hanging arms, narrow enough that a drawn
+pose is an everyday one. Deep hip and knee bends (squats, chairs) therefore lie three to five standard deviations
+out. Knees and elbows bend one way only: their means are bent, and samples are cut at the range.
 
 Rotation vectors per joint in the T-pose's axes (x the body's left, y up, z front), radians. They are treated
 as three plain numbers: right for single-axis bends, good enough for a prior elsewhere.
 """
 
 import os
-import tempfile
 import zipfile
 from dataclasses import dataclass
 from functools import cached_property
@@ -135,10 +134,10 @@ class PosePrior:
     def save(self, path: str | Path) -> None:
         """Write an .npz with the keys mean, covariance, low, high (atomically)."""
         path = Path(path)
-        handle, temporary = tempfile.mkstemp(suffix=".npz", prefix=path.stem, dir=path.parent)
-        with os.fdopen(handle, "wb") as stream:
+        temporary = path.with_name(f".{path.name}.{os.getpid()}")
+        with temporary.open("wb") as stream:
             np.savez(stream, mean=self.mean, covariance=self.covariance, low=self.low, high=self.high)
-        Path(temporary).replace(path)
+        temporary.replace(path)
 
     @staticmethod
     def load(path: str | Path) -> "PosePrior":

@@ -1,8 +1,7 @@
 """A tape around a finished mesh: girths, volume and extents as an anthropometrist would read them.
 
 Standing T-pose, y up, metres. A girth is the convex perimeter of a plane section, as a tape bridges hollows.
-Landmark levels follow the survey's definitions (Gordon et al. 2014) as fractions of the average body's
-stature.
+Levels are fixed fractions of the average body's stature, near the survey's landmarks (Gordon et al. 2014).
 """
 
 from collections.abc import Callable
