@@ -280,17 +280,28 @@ def _find_ghosts(
         if labels.max() < 2:
             continue
         moving = [_moving_shares(finder, labels, idx, frame[idx], share[idx]) for idx in range(len(frame))]
-        typical = np.nanmedian(np.array(moving), axis=0)
-        subject = int(np.nanargmax(typical))
-        for part in range(labels.max()):
-            if part == subject or not typical[part] < min(0.2, 0.4 * typical[subject]):
+        typical = [_upper_median([camera[part] for camera in moving]) for part in range(labels.max())]
+        now = [stack[time_idx] for stack in samples]
+        subject = int(labels[_subject_voxels(finder, frame, now, steady)][0])
+        for part in range(1, labels.max() + 1):
+            if part == subject or not typical[part - 1] < min(0.2, 0.4 * typical[subject - 1]):
                 continue
             for camera_idx in range(len(samples)):
-                where = finder.outline(camera_idx, labels == part + 1)
+                where = finder.outline(camera_idx, labels == part)
                 zones[camera_idx] |= where & (nearest[camera_idx] > CLEAR_LEVELS // 2)
                 differs = departure(steady[camera_idx], small[camera_idx]) > CLEAR_LEVELS // 2
                 patches[camera_idx] |= where & differs & (share[camera_idx] >= _STEADY_SHARE)
     return patches, [grown(zone, 3.0) for zone in zones]
+
+
+def _upper_median(shares: list[float]) -> float:
+    """The middle share, the higher of two, of the cameras that see the part; 1 where none does.
+
+    The higher, because a subject may walk straight along the axis of half the cameras and not move in their
+    pictures.
+    """
+    seen = sorted(share for share in shares if not np.isnan(share))
+    return seen[len(seen) // 2] if seen else 1.0
 
 
 def _moving_shares(
