@@ -22,15 +22,15 @@ from jaxtyping import Float
 BMI_RANGE = (16.0, 45.0)
 """kg/m2: nobody is drawn outside it."""
 CIVILIAN_BMI = {"female": (24.3, 0.205), "male": (25.8, 0.175)}
-"""Median (kg/m2) and standard deviation of the logarithm. Assumed round figures, not taken from one table; for
+"""Median (kg/m2) and standard deviation of the logarithm. Assumed figures, not taken from a table; for
 comparison, the median of U.S. adults in NHANES III (1988-1994) was 25.5 (Kuczmarski et al. 1997)."""
 MAX_SCORE = 2.5
 """Scores are clipped here: beyond it the primitives of the anatomy begin to interpenetrate."""
 FREE_FACTORS = ("bust", "definition")
 
 # Measures of the survey that are not taken at the place (or in the state) the anatomy wants, with the factor
-# between the two. Flexed arm girths shrink at rest; the lower thigh is taken above the knee. The factors are ours:
-# each makes the survey's average agree with the average that the station tables were modelled on.
+# between the two. Flexed arm girths shrink at rest; the lower thigh is taken above the knee. The factors are
+# ours: each makes the survey's average agree with the average that the station tables were modelled on.
 KNEE_FROM_LOWER_THIGH = 0.94
 RESTING_FROM_FLEXED_BICEPS = 0.94
 RESTING_FROM_FLEXED_FOREARM = 0.97
