@@ -3,10 +3,10 @@
 Ranges are round figures of the usual clinical tables (those of the American Academy of Orthopaedic Surgeons
 and Boone & Azen 1979 are the common sources; hips, knees, ankles, elbows and wrists were compared with
 secondary tables, the originals were not consulted). How trunk and neck share theirs among the model's joints
-is ours, and so are means, standard deviations and couplings: a relaxed stance with hanging arms, narrow enough
-that a drawn pose is an everyday one. Deep hip and knee bends (squats, chairs) therefore lie three to five
-standard deviations out. Knees and elbows bend one way only: their means are bent, and samples are cut at the
-range.
+is ours, and so are means, standard deviations and couplings: a relaxed stance with hanging arms, narrow
+enough that a drawn pose is an everyday one. Deep hip and knee bends (squats, chairs) therefore lie three to
+five standard deviations out. Knees and elbows bend one way only: their means are bent, and samples are cut
+at the range.
 
 Rotation vectors per joint in the T-pose's axes (x the body's left, y up, z front), radians. They are treated
 as three plain numbers: right for single-axis bends, good enough for a prior elsewhere.
