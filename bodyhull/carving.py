@@ -18,11 +18,21 @@ from bodyhull.errors import UserError
 from bodyhull.folder import RunFolder, write_atomically
 from capture.recording import Recording, open_recording
 from hull.errors import HullError
-from hull.mesh_file import load_mesh, save_mesh
+from hull.mesh_file import MeshFileError, load_mesh, save_mesh
 from hull.quality import silhouette_agreement
 from hull.visual_hull import build_hull
 
-NOTED_PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless", "pycolmap", "scikit-image", "open3d", "jax", "pyrender")
+AGAIN = "run with --overwrite to redo it, or choose another --out"
+NOTED_PACKAGES = (
+    "numpy",
+    "scipy",
+    "opencv-contrib-python-headless",
+    "pycolmap",
+    "scikit-image",
+    "open3d",
+    "jax",
+    "pyrender",
+)
 
 
 @dataclass(frozen=True)
@@ -72,24 +82,27 @@ def software() -> dict[str, str]:
 def claim(folder: RunFolder, config: RunConfig, fingerprint: str) -> dict[str, Any]:
     """Bind the run folder to this input and these settings, or refuse where it holds another's work.
 
-    Returns the state of run.json. With --overwrite the earlier entries are dropped (the files are replaced one by one).
+    Returns the state of run.json. With --overwrite the earlier entries are dropped (the files are replaced
+    one by one).
     """
-    state = folder.read_state()
+    state: dict[str, Any] = {} if config.overwrite else folder.read_state()
     settings = config.carve_settings()
-    if state and not config.overwrite:
-        before = state.get("inputs", {}).get("fingerprint")
-        again = "add --overwrite to redo it, or choose another --out"
-        if before is not None and before != fingerprint:
-            raise UserError(
-                f"{folder.root}: made from another input (fingerprint {before[:12]}, the recording now has "
-                f"{fingerprint[:12]}); {again}"
-            )
+    if state:
         old = {k: state.get("configuration", {}).get(k) for k in settings}
         changed = [f"{k} was {old[k]!r}, now {v!r}" for k, v in settings.items() if old[k] != v]
         if changed:
-            raise UserError(f"{folder.root}: made with other settings ({'; '.join(changed)}); {again}")
-        state["configuration"] = config.as_dict()
+            raise UserError(f"{folder.root}: made with other settings ({'; '.join(changed)}); {AGAIN}")
+        refuse_other_input(folder, fingerprint)
+        # The fit's own settings are taken over by the fit, once it has agreed to them.
+        kept = (
+            {k: state["configuration"].get(k) for k in config.fit_settings()}
+            if "fit" in state["stages"]
+            else {}
+        )
+        state["configuration"] = {**config.as_dict(), **kept}
     else:
+        if folder.state_file.is_file():
+            folder.remove_results()
         state = {
             "configuration": config.as_dict(),
             "inputs": {"recording": str(config.recording.absolute()), "fingerprint": fingerprint},
@@ -100,18 +113,33 @@ def claim(folder: RunFolder, config: RunConfig, fingerprint: str) -> dict[str, A
     return state
 
 
+def refuse_other_input(folder: RunFolder, fingerprint: str) -> None:
+    """Raise UserError where the run folder was made from a recording with another fingerprint."""
+    before = folder.require_state().get("inputs", {}).get("fingerprint")
+    if before is not None and before != fingerprint:
+        raise UserError(
+            f"{folder.root}: made from another input (fingerprint {before[:12]}, the recording now has "
+            f"{fingerprint[:12]}); {AGAIN}"
+        )
+
+
 def carve_stage(config: RunConfig) -> Recording:
     """Open the recording, carve every frame that is not carved yet, and record how each went.
 
-    Raises UserError or RecordingError for what the user can cause; a frame that cannot be carved is marked "failed" and
-    never stops the others.
+    Raises UserError or RecordingError for what the user can cause; a frame that cannot be carved is marked
+    "failed" and never stops the others.
     """
+    if not 0.5 <= config.voxel_mm <= 100:
+        raise UserError(
+            f"--voxel-mm {config.voxel_mm:g}: choose a grid spacing between 0.5 and 100 mm; 8 is usual"
+        )
     recording = open_for(config)
     folder = RunFolder(config.out)
     state = claim(folder, config, recording.fingerprint())
     for note in recording.notes:
         tqdm.write(f"note: {note}", file=sys.stderr)
-    write_atomically(folder.rig_file, recording.rig.save)
+    if not folder.rig_file.is_file():
+        write_atomically(folder.rig_file, recording.rig.save)
     state["recording"] = {
         "name": recording.name,
         "unit": recording.unit,
@@ -122,7 +150,7 @@ def carve_stage(config: RunConfig) -> Recording:
         "notes": list(recording.notes),
     }
     folder.write_state(state)
-    known: dict[str, Any] = {} if config.overwrite else state.get("stages", {}).get("hull", {}).get("frames", {})
+    known: dict[str, Any] = state["stages"].get("hull", {}).get("frames", {})
     frames = dict(known)
     started = time.perf_counter()
     todo = [k for k in recording.frame_ids if not _carved(folder, k, known)]
@@ -130,7 +158,9 @@ def carve_stage(config: RunConfig) -> Recording:
         frames[f"{frame_id:06d}"] = carve_frame(recording, folder, frame_id, config.voxel_mm).as_dict()
         folder.update_stage("hull", frames=frames)
     if todo:
-        folder.update_stage("hull", seconds=round(time.perf_counter() - started, 2), carved=len(todo), frames=frames)
+        folder.update_stage(
+            "hull", seconds=round(time.perf_counter() - started, 2), carved=len(todo), frames=frames
+        )
     failed = [k for k in recording.frame_ids if frames[f"{k:06d}"]["status"] == "failed"]
     if len(failed) == len(recording.frame_ids):
         first = frames[f"{failed[0]:06d}"]["problems"]
@@ -145,9 +175,10 @@ def _carved(folder: RunFolder, frame_id: int, known: dict[str, Any]) -> bool:
     if entry["status"] == "failed":
         return True
     try:
-        return len(load_mesh(folder.hull(frame_id))[0]) > 0
-    except (OSError, ValueError):
+        load_mesh(folder.hull(frame_id))
+    except (OSError, MeshFileError):
         return False
+    return True
 
 
 def carve_frame(recording: Recording, folder: RunFolder, frame_id: int, voxel_mm: float) -> CarvedFrame:

@@ -8,20 +8,25 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+import bodyhull
 from bodyhull.config import RunConfig
 from bodyhull.errors import ERROR, FRAMES_FAILED, OK, UserError
 from bodyhull.folder import RunFolder
+
+if TYPE_CHECKING:
+    from fit.settings import FitSettings
 
 RunArgument = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 
 
 @dataclass(frozen=True)
 class Run(RunConfig):
-    """The main job: a recording in, a body and overlay films out. Finished work is kept; run it again to resume."""
+    """The main job: a recording in, a body and overlay films out. Finished work is kept; run it again to
+    resume."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,8 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Synth:
-    """Film a clothed synthetic person with a synthetic rig: a recording in the INRIA layout, with the truth."""
+    """Film a clothed synthetic person with a synthetic rig: a recording in the INRIA layout, with the
+    truth."""
 
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Folder of the recording to make."""
@@ -132,12 +138,13 @@ def joined_signs(arguments: Sequence[str]) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the `bodyhull` command; exits with 0, 1 (error), 2 (usage) or 3 (finished, but frames failed)."""
+    """Entry point of the `bodyhull` command; exits with 0, 1 (error), 2 (usage) or 3 (finished, but frames
+    failed)."""
     words = joined_signs(sys.argv[1:] if arguments is None else arguments)
-    command: Command = tyro.cli(  # type: ignore[call-overload]
+    command: Command = tyro.cli(
         Command,
         prog="bodyhull",
-        description="From a calibrated multi-camera recording of a clothed person to the body under the clothes.",
+        description=bodyhull.__doc__,
         args=words,
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
     )
@@ -154,10 +161,24 @@ def guarded(command: object) -> int:
     from render.gl import GlError
     from render.synthetic import SyntheticError
 
-    known = (UserError, RecordingError, HullError, MeshFileError, BodyModelError, TruthError, GlError, SyntheticError)
+    known = (
+        UserError,
+        RecordingError,
+        HullError,
+        MeshFileError,
+        BodyModelError,
+        TruthError,
+        GlError,
+        SyntheticError,
+    )
     try:
         return perform(command)
     except known as error:
+        print(f"bodyhull: error: {error}", file=sys.stderr)
+        return ERROR
+    except OSError as error:
+        # A full disk, a missing permission, a drive that went away: Python's own text names the file and the
+        # reason.
         print(f"bodyhull: error: {error}", file=sys.stderr)
         return ERROR
     except KeyboardInterrupt:
@@ -212,9 +233,6 @@ def configuration_of(
         config = dataclasses.replace(config, body=body)
     if keypoints is not None:
         config = dataclasses.replace(config, keypoints=keypoints)
-    if body is not None or keypoints is not None:
-        state["configuration"] = dataclasses.replace(config, overwrite=False).as_dict()
-        folder.write_state(state)
     return config
 
 
@@ -225,27 +243,32 @@ def frames_code(root: Path, stage: str) -> int:
     if not failed:
         return OK
     listed = ", ".join(failed[:8]) + (f" and {len(failed) - 8} more" if len(failed) > 8 else "")
-    print(f"bodyhull: {len(failed)} of {len(frames)} frames failed in stage {stage}: {listed}", file=sys.stderr)
+    print(
+        f"bodyhull: {len(failed)} of {len(frames)} frames failed in stage {stage}: {listed}", file=sys.stderr
+    )
     return FRAMES_FAILED
 
 
-def run(config: RunConfig) -> int:
-    """All stages in order."""
+def run(config: RunConfig, settings: FitSettings | None = None) -> int:
+    """All stages in order; returns the exit code. settings: of the fit, where not the usual ones."""
     from bodyhull.carving import carve_stage
     from bodyhull.drawing import draw_stage
     from bodyhull.fitting import fit_stage
 
     started = time.perf_counter()
     carve_stage(config)
-    fit_stage(config)
+    fit_stage(config, settings)
     draw_stage(config)
     folder = RunFolder(config.out)
     films = sorted(folder.overlay("x").parent.glob("*.mp4"))
     print(f"fusion shape: {folder.fusion_mesh}")
     print(f"bodies:       {folder.mesh(0).parent}")
-    print(f"overlay:      {films[0] if films else '-'}" + (f" and {len(films) - 1} more" if len(films) > 1 else ""))
+    print(
+        f"overlay:      {films[0] if films else '-'}"
+        + (f" and {len(films) - 1} more" if len(films) > 1 else "")
+    )
     print(f"report:       {folder.report}   ({time.perf_counter() - started:.0f} s)")
-    return max(frames_code(config.out, "hull"), frames_code(config.out, "fit"))
+    return frames_code(config.out, "fit")
 
 
 def evaluate(command: Evaluate) -> int:
@@ -276,8 +299,17 @@ def parsed_size(text: str) -> tuple[int, int]:
 def synthesise(command: Synth) -> int:
     """Film and tell where."""
     from fit.body.model import load_body
+    from render.motions import MOTIONS
     from render.synthetic import film
+    from render.wardrobe import OUTFITS
 
+    for option, value, known in (("motion", command.motion, MOTIONS), ("garment", command.garment, OUTFITS)):
+        if value not in known:
+            raise UserError(f"--{option} {value}: there is no such {option}; there are: {', '.join(known)}")
+    if command.frames < 1 or command.seed < 0:
+        raise UserError(
+            f"--frames {command.frames} --seed {command.seed}: at least 1 frame, and a seed of 0 or more"
+        )
     truth = film(
         command.out,
         body=load_body(command.body),
@@ -298,7 +330,16 @@ def demo(command: Demo) -> int:
     """The main job on a synthetic recording, then the comparison with the truth."""
     recording, out = command.out / "recording", command.out / "run"
     started = time.perf_counter()
-    synthesise(Synth(recording, frames=12, motion=command.motion, garment=command.garment, seed=command.seed, overwrite=True))
+    synthesise(
+        Synth(
+            recording,
+            frames=12,
+            motion=command.motion,
+            garment=command.garment,
+            seed=command.seed,
+            overwrite=True,
+        )
+    )
     code = run(RunConfig(recording, out, overwrite=True))
     if code != ERROR:
         evaluate(Evaluate(out, recording / "truth"))

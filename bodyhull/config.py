@@ -10,6 +10,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from bodyhull.errors import UserError
+
 Units = Literal["auto", "m", "cm", "mm"]
 Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 
@@ -19,7 +21,8 @@ class RunConfig:
     """What to run on and how."""
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
-    """Folder of the recording: setup/ and SilhouettesPictures/ (INRIA layout), or videos/ with calibration and plates."""
+    """Folder of the recording: setup/ and SilhouettesPictures/ (INRIA layout), or videos/ with calibration
+    and plates."""
     out: Annotated[Path, tyro.conf.arg(metavar="RUN")]
     """Folder of the run; made if missing. Finished work in it is kept."""
     sequence: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
@@ -27,7 +30,8 @@ class RunConfig:
     body: str = "free:neutral"
     """Body model: free:neutral, free:female, free:male, or the path of an .npz file in SMPL's format."""
     calibration: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Calibration to use instead of the recording's own: a .qca.txt file, a rig.json, or a folder of camNN.txt."""
+    """Calibration to use instead of the recording's own: a .qca.txt file, a rig.json, or a folder of
+    camNN.txt."""
     frames: Annotated[str | None, tyro.conf.arg(metavar="START:STOP:STEP")] = None
     """Which frame numbers; all by default."""
     voxel_mm: float = 8.0
@@ -61,6 +65,13 @@ class RunConfig:
     def from_dict(values: dict[str, object]) -> RunConfig:
         """Inverse of as_dict."""
         paths = {"recording", "out", "calibration", "background", "keypoints"}
+        fields = set(RunConfig.__dataclass_fields__)
+        if set(values) != fields:
+            odd = sorted(fields.symmetric_difference(values))
+            raise UserError(
+                f"run.json: its configuration was written by another version of bodyhull (it differs in "
+                f"{', '.join(odd)}); make the run again in another --out"
+            )
         known = {k: Path(str(v)) if k in paths and v is not None else v for k, v in values.items()}
         return RunConfig(**known)  # type: ignore[arg-type]
 

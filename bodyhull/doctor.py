@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import shutil
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,9 +22,12 @@ class Finding:
 
 
 def findings() -> list[Finding]:
-    """Look at Python, packages, OpenGL (a triangle is really drawn), cores, memory, disk, JAX devices, the body cache."""
+    """Look at Python, packages, OpenGL (a triangle is really drawn), cores, memory, disk, JAX devices, the
+    body cache."""
     out = [
-        Finding("python", f"{platform.python_version()} on {platform.platform()}", platform.python_version_tuple() >= ("3", "11")),
+        Finding(
+            "python", f"{platform.python_version()} on {platform.platform()}", sys.version_info >= (3, 11)
+        ),
     ]
     for name, version in software().items():
         if name != "python":
@@ -44,7 +48,9 @@ def _opengl() -> Finding:
     report = probe()
     if report.problem is not None:
         return Finding("OpenGL off-screen", report.problem, False)
-    return Finding("OpenGL off-screen", f"{report.platform}: {report.renderer} ({report.version}) drew a triangle")
+    return Finding(
+        "OpenGL off-screen", f"{report.platform}: {report.renderer} ({report.version}) drew a triangle"
+    )
 
 
 def _cores() -> int:
@@ -71,7 +77,11 @@ def _jax() -> Finding:
         kinds = ", ".join(f"{d.platform}:{d.device_kind}" for d in devices)
     except Exception as error:  # a broken driver raises whatever it likes; the doctor must tell, not fall ill
         return Finding("JAX", f"{type(error).__name__}: {error}", False)
-    gpu = "a GPU is there" if any(d.platform != "cpu" for d in devices) else "no GPU: everything runs on the CPU"
+    gpu = (
+        "a GPU is there"
+        if any(d.platform != "cpu" for d in devices)
+        else "no GPU: everything runs on the CPU"
+    )
     return Finding("JAX devices", f"{kinds} ({gpu})")
 
 

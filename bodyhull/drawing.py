@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from bodyhull.carving import open_for
-from bodyhull.config import RunConfig
+from bodyhull.carving import open_for, refuse_other_input
+from bodyhull.config import RunConfig, digest
+from bodyhull.errors import UserError
 from bodyhull.fitting import load_track
 from bodyhull.folder import RunFolder
 from capture.recording import Recording
@@ -36,11 +37,17 @@ def draw_stage(config: RunConfig) -> None:
     folder.require_state()
     track = load_track(folder)
     recording = open_for(config)
-    state = folder.read_state()
-    fit_key = state.get("stages", {}).get("fit", {}).get("key")
-    entry = state.get("stages", {}).get("render", {})
+    refuse_other_input(folder, recording.fingerprint())
+    fit_key = folder.stage("fit").get("key")
+    if not fit_key:
+        raise UserError(
+            f"{folder.root}: its fit was stopped half-way; go on with: bodyhull fit {folder.root}"
+        )
+    entry = folder.stage("render")
     good = [int(k) for k, s in zip(track["frame_ids"], track["status"], strict=True) if s != "failed"]
-    agreement: dict[str, list[float | None]] = dict(entry.get("agreement", {})) if entry.get("fit_key") == fit_key else {}
+    agreement: dict[str, list[float | None]] = (
+        dict(entry.get("agreement", {})) if entry.get("fit_key") == fit_key else {}
+    )
     started = time.perf_counter()
     todo = [
         k
@@ -52,15 +59,22 @@ def draw_stage(config: RunConfig) -> None:
             scores: list[float | None] = []
             film = folder.overlay(recording.rig[camera_idx].name)
             film.parent.mkdir(parents=True, exist_ok=True)
-            write_video(film, _film(recording, folder, track, camera_idx, good, scores, bar), fps=_fps(recording, good))
+            write_video(
+                film,
+                _film(recording, folder, track, camera_idx, good, scores, bar),
+                fps=_fps(recording, good),
+            )
             agreement[recording.rig[camera_idx].name] = scores
-    seconds = round(time.perf_counter() - started, 2) if todo else entry.get("seconds", 0.0)
-    folder.update_stage("render", fit_key=fit_key, seconds=seconds, agreement=agreement, frames=good)
-    write_run_report(config, recording, track)
+            folder.update_stage("render", fit_key=fit_key, agreement=agreement, frames=good)
+    if todo:
+        folder.update_stage("render", seconds=round(time.perf_counter() - started, 2))
+    if todo or not folder.report.is_file() or folder.stage("render").get("report_key") != report_key(folder):
+        write_run_report(config, recording, track)
 
 
 def _fps(recording: Recording, frames: list[int]) -> float:
-    """Films play at a pace at which every frame can be seen: 30 a second for long recordings, slower for short ones."""
+    """Films play at a pace at which every frame can be seen: 30 a second for long recordings, slower for
+    short ones."""
     return 30.0 if len(frames) > 90 else 12.0 if len(frames) > 24 else 6.0
 
 
@@ -99,20 +113,45 @@ def _film(
         bar.update()
 
 
+def report_key(folder: RunFolder) -> str:
+    """What the report's content depends on; where it has not changed, the page on disk is the one that would
+    be written."""
+    stages = folder.read_state()["stages"]
+    return digest(
+        {"stages": {k: v for k, v in stages.items() if k != "render"}, "errors": current_errors(folder)}
+    )
+
+
+def current_errors(folder: RunFolder) -> dict[str, Any] | None:
+    """The evaluation of the fit that the folder holds now, or None: an earlier fit's errors are not this
+    one's."""
+    try:
+        errors = json.loads(folder.evaluation.read_text())
+    except (OSError, ValueError):
+        return None
+    return errors if errors.get("fit_key") == folder.stage("fit").get("key") else None
+
+
 def write_run_report(config: RunConfig, recording: Recording, track: dict[str, Any]) -> None:
     """Write report.html from what run.json and the evaluation know."""
     folder = RunFolder(config.out)
     state = folder.read_state()
     stages = state["stages"]
     good = stages["render"]["frames"]
-    scores = {name: [v for v in values if v is not None] for name, values in stages["render"]["agreement"].items()}
+    scores = {
+        name: [v for v in values if v is not None] for name, values in stages["render"]["agreement"].items()
+    }
     everything = [v for values in scores.values() for v in values]
     hull_frames, fit_frames = stages["hull"]["frames"], stages["fit"]["frames"]
     problems = list(recording.notes)
     for entry in (*hull_frames.values(), *fit_frames.values()):
         problems += [p for p in entry["problems"] if p not in problems]
     hull_scores = {
-        name: [f["agreement"][k] for f in hull_frames.values() if f["agreement"] and f["agreement"][k] is not None]
+        name: [
+            f["agreement"][k]
+            for f in hull_frames.values()
+            if f["agreement"] and f["agreement"][k] is not None
+        ]
         for k, name in enumerate(recording.rig.names)
     }
     tables = [
@@ -129,15 +168,20 @@ def write_run_report(config: RunConfig, recording: Recording, track: dict[str, A
                 )
                 for camera in recording.rig
             ),
-            "Intersection over union of the projected surface with the silhouette, median over frames. Under loose clothes "
-            "a right body covers less than the silhouette.",
+            "Intersection over union of the projected surface with the silhouette, median over frames. Under "
+            "loose clothes a right body covers less than the silhouette.",
             digits=3,
         ),
         Table(
             "Frames",
             ("frame", "hull", "fit", "scan to body, mm"),
             tuple(
-                (f, hull_frames[f]["status"], fit_frames.get(f, {}).get("status", "-"), fit_frames.get(f, {}).get("distance_mm"))
+                (
+                    f,
+                    hull_frames[f]["status"],
+                    fit_frames.get(f, {}).get("status", "-"),
+                    fit_frames.get(f, {}).get("distance_mm"),
+                )
                 for f in sorted(hull_frames)
             ),
             "Mean distance of the hull's points to the body: mostly cloth, not error.",
@@ -147,10 +191,12 @@ def write_run_report(config: RunConfig, recording: Recording, track: dict[str, A
         ("frames fitted", f"{len(good)} of {len(hull_frames)}"),
         ("body over silhouette, IoU", f"{_median(everything):.3f}" if everything else "-"),
     ]
-    if folder.evaluation.is_file():
-        errors = json.loads(folder.evaluation.read_text())
+    errors = current_errors(folder)
+    if errors is not None:
         tables.insert(0, error_table(errors))
-        headline.append(("fusion shape, paper's measure", f"{errors['summary']['fusion, paper']['rms']:.2f} mm RMS"))
+        headline.append(
+            ("fusion shape, paper's measure", f"{errors['summary']['fusion, paper']['rms']:.2f} mm RMS")
+        )
         headline.append(("posed body, direct", f"{errors['summary']['detailed, direct']['rms']:.2f} mm RMS"))
     facts = [
         ("recording", f"{state['inputs']['recording']} {recording.name}".strip()),
@@ -158,7 +204,10 @@ def write_run_report(config: RunConfig, recording: Recording, track: dict[str, A
         ("unit of the calibration", f"{recording.unit} ({recording.metres_per_unit:g} m)"),
         ("up", " ".join(f"{v:g}" for v in recording.up)),
         ("voxel", f"{config.voxel_mm:g} mm"),
-        *((f"seconds, {name}", f"{stages[name].get('seconds', 0):.1f}") for name in ("hull", "fit", "render")),
+        *(
+            (f"seconds, {name}", f"{stages[name].get('seconds', 0):.1f}")
+            for name in ("hull", "fit", "render")
+        ),
         *((name, str(version)) for name, version in state.get("software", {}).items()),
     ]
     title = recording.name or config.recording.resolve().name
@@ -177,14 +226,20 @@ def write_run_report(config: RunConfig, recording: Recording, track: dict[str, A
             films=tuple((name, f"overlay/{name}.mp4") for name in recording.rig.names),
         ),
     )
+    folder.update_stage("render", report_key=report_key(folder))
 
 
 def error_table(errors: dict[str, Any]) -> Table:
     """The evaluation as a table."""
     rows = tuple(
         (name, e["rms"], e["mean"], e["bias"], e["p90"]) for name, e in errors["summary"].items()
-    ) + tuple((f"detailed, direct: {name}", e["rms"], e["mean"], e["bias"], e["p90"]) for name, e in errors["parts"].items())
-    return Table("Errors against the true body, mm", ("what", "RMS", "mean", "bias", "90 %"), rows, errors["protocol"])
+    ) + tuple(
+        (f"detailed, direct: {name}", e["rms"], e["mean"], e["bias"], e["p90"])
+        for name, e in errors["parts"].items()
+    )
+    return Table(
+        "Errors against the true body, mm", ("what", "RMS", "mean", "bias", "90 %"), rows, errors["protocol"]
+    )
 
 
 def _median(values: list[float]) -> float | None:
@@ -192,8 +247,11 @@ def _median(values: list[float]) -> float | None:
 
 
 def _contact_sheet(recording: Recording, folder: RunFolder, frames: list[int]) -> Iterator[Row]:
-    """Picture, silhouette, hull, body, overlay and agreement for some frames and cameras spread over the run."""
-    chosen = sorted({frames[i] for i in np.linspace(0, len(frames) - 1, min(SHEET_FRAMES, len(frames))).astype(int)})
+    """Picture, silhouette, hull, body, overlay and agreement for some frames and cameras spread over the
+    run."""
+    chosen = sorted(
+        {frames[i] for i in np.linspace(0, len(frames) - 1, min(SHEET_FRAMES, len(frames))).astype(int)}
+    )
     cameras = sorted({int(i) for i in np.linspace(0, len(recording.rig), SHEET_CAMERAS, endpoint=False)})
     for frame_id in tqdm(chosen, desc="contact sheet", unit="frame", leave=False):
         body, hull = load_mesh(folder.mesh(frame_id)), load_mesh(folder.hull(frame_id))
@@ -220,4 +278,6 @@ def _contact_sheet(recording: Recording, folder: RunFolder, frames: list[int]) -
 
 
 def _on_paper(colour: np.ndarray, coverage: np.ndarray) -> np.ndarray:
-    return np.clip(colour.astype(np.float32) + 0.92 * (255 - coverage[:, :, None].astype(np.float32)), 0, 255).astype(np.uint8)
+    return np.clip(
+        colour.astype(np.float32) + 0.92 * (255 - coverage[:, :, None].astype(np.float32)), 0, 255
+    ).astype(np.uint8)

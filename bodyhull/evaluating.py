@@ -1,4 +1,5 @@
-"""`bodyhull evaluate`: a run against the true naked body, in millimetres, by the paper's measure and directly."""
+"""`bodyhull evaluate`: a run against the true naked body, in millimetres, by the paper's measure and
+directly."""
 
 from __future__ import annotations
 
@@ -32,9 +33,9 @@ from fit.truth import SCORED_REGIONS, load_truth
 from hull.mesh_file import load_mesh
 
 PROTOCOL = (
-    "Distance from true vertices to the result's surface: outer vertices of torso, arms, legs and neck, weighted by area, all "
-    "frames. 'paper': the true body is first re-posed to fit the result (Zhang et al. 2017, section 6.2); 'direct': as it stands in "
-    "that frame. Bias is positive where the result is too fat."
+    "Distance from true vertices to the result's surface: outer vertices of torso, arms, legs and neck, "
+    "weighted by area, all frames. 'paper': the true body is first re-posed to fit the result (Zhang et al. "
+    "2017, section 6.2); 'direct': as it stands in that frame. Bias is positive where the result is too fat."
 )
 
 
@@ -47,11 +48,13 @@ def evaluate_stage(config: RunConfig, truth_path: Path) -> dict[str, Any]:
     state = folder.require_state()
     track, fusion = load_track(folder), load_fusion(folder)
     truth = load_truth(truth_path, state["recording"]["name"])
-    model = load_body(config.body)
+    fit = state["stages"]["fit"]
+    model = load_body(fit["body"])
     if model.content_hash != str(track["body_hash"]):
         raise UserError(
-            f"{folder.root}: was fitted with another version of body '{config.body}' "
-            f"({str(track['body_hash'])[:12]}, now {model.content_hash[:12]}); run: bodyhull fit {folder.root} --overwrite"
+            f"{folder.root}: was fitted with another version of body '{fit['body']}' "
+            f"({str(track['body_hash'])[:12]}, now {model.content_hash[:12]}); "
+            f"run: bodyhull fit {folder.root} --overwrite"
         )
     fitter = Fitter.of(model)
     world_from_body = track["recording_from_body"]
@@ -93,14 +96,19 @@ def evaluate_stage(config: RunConfig, truth_path: Path) -> dict[str, Any]:
             note(f"{name}, paper", pose_truth_to(true, truth.faces, scored, rig, surface), surface)
         outside.append(inside_share(detailed.vertices, hull))
     if not used:
-        raise UserError(f"{truth_path}: the truth holds none of the run's fitted frames ({track['frame_ids'].tolist()})")
+        raise UserError(
+            f"{truth_path}: the truth holds none of the run's fitted frames ({track['frame_ids'].tolist()})"
+        )
     order = ("hull, direct", "fusion, direct", "detailed, direct", "fusion, paper", "detailed, paper")
     errors: dict[str, Any] = {
         "protocol": PROTOCOL,
+        "fit_key": fit["key"],
         "frames": used,
         "frames_without_truth_or_fit": missing,
         "summary": {name: asdict(average(rows[name])) for name in order},
-        "parts": {name: asdict(average([s for s in values if np.isfinite(s.rms)])) for name, values in parts.items()},
+        "parts": {
+            name: asdict(average([s for s in values if np.isfinite(s.rms)])) for name, values in parts.items()
+        },
         "detailed_rms_by_frame": [s.rms for s in rows["detailed, direct"]],
         "body_outside_hull_share": float(np.mean(outside)),
     }
@@ -111,7 +119,13 @@ def evaluate_stage(config: RunConfig, truth_path: Path) -> dict[str, Any]:
 def error_text(errors: dict[str, Any]) -> str:
     """The errors as a table for the terminal."""
     lines = [f"{'error, mm':<26}{'RMS':>8}{'mean':>8}{'bias':>8}{'90 %':>8}"]
-    entries = [*errors["summary"].items(), *((f"detailed, direct: {k}", v) for k, v in errors["parts"].items())]
-    lines += [f"{name:<26}{e['rms']:8.2f}{e['mean']:8.2f}{e['bias']:+8.2f}{e['p90']:8.2f}" for name, e in entries]
-    lines.append(f"{'body outside the hull':<26}{100 * errors['body_outside_hull_share']:7.2f}% of its vertices (by more than 1 mm)")
+    entries = [
+        *errors["summary"].items(),
+        *((f"detailed, direct: {k}", v) for k, v in errors["parts"].items()),
+    ]
+    lines += [
+        f"{name:<26}{e['rms']:8.2f}{e['mean']:8.2f}{e['bias']:+8.2f}{e['p90']:8.2f}" for name, e in entries
+    ]
+    outside = 100 * errors["body_outside_hull_share"]
+    lines.append(f"{'body outside the hull':<26}{outside:7.2f}% of its vertices (by more than 1 mm)")
     return "\n".join(lines)

@@ -1,4 +1,5 @@
-"""Stage fit: hulls in; alignments, fusion shape and track out, in the recording's world (paper sections 4.1 to 4.3).
+"""Stage fit: hulls in; alignments, fusion shape and track out, in the recording's world (paper sections 4.1
+to 4.3).
 
 Finished frames are kept: an alignment on disk is used again as long as body, settings and hull are the same.
 """
@@ -19,6 +20,7 @@ from bodyhull.errors import UserError
 from bodyhull.folder import RunFolder, load_arrays, save_arrays
 from fit.align import Alignment, align_sequence
 from fit.body.model import BodyModel, load_body
+from fit.closest import Container
 from fit.frames import apply, recording_from_body, scan_in_body_frame
 from fit.fuse import FusionShape, fuse
 from fit.initialise import PoseFinder
@@ -41,45 +43,82 @@ def load_hull_scan(path: Path, n_points: int, seed: int) -> Scan:
 
 
 def fit_stage(config: RunConfig, settings: FitSettings | None = None) -> None:
-    """Fit the run's hulls. Raises UserError where there is none, or where another body's fit is in the folder."""
+    """Fit the run's hulls. Raises UserError where there is none, or where another body's fit is in the
+    folder."""
     settings = FitSettings() if settings is None else settings
     folder = RunFolder(config.out)
     state = folder.require_state()
     recording = state.get("recording")
     hulls = state.get("stages", {}).get("hull", {}).get("frames", {})
     if not recording or not hulls:
-        raise UserError(f"{folder.root}: there are no hulls to fit; run: bodyhull carve RECORDING --out {folder.root}")
-    frame_ids = [k for k in recording["frame_ids"] if hulls.get(f"{k:06d}", {}).get("status") in ("ok", "degraded")]
+        raise UserError(
+            f"{folder.root}: there are no hulls to fit; run: bodyhull carve RECORDING --out {folder.root}"
+        )
+    if any(f"{k:06d}" not in hulls for k in recording["frame_ids"]):
+        raise UserError(
+            f"{folder.root}: only {len(hulls)} of {len(recording['frame_ids'])} frames are carved; "
+            f"finish them first: bodyhull carve RECORDING --out {folder.root}"
+        )
+    frame_ids = [k for k in recording["frame_ids"] if hulls[f"{k:06d}"]["status"] in ("ok", "degraded")]
     if not frame_ids:
         raise UserError(f"{folder.root}: every frame's hull failed, so there is nothing to fit")
 
     model = load_body(config.body)
-    settings_key = digest({"body": model.content_hash, **config.fit_settings(), "settings": asdict(settings)})
+    settings_key = digest(
+        {
+            "body": model.content_hash,
+            "keypoints": keypoints_print(config.keypoints),
+            "settings": asdict(settings),
+        }
+    )
     key = digest({"settings": settings_key, "hulls": {f: hulls[f]["volume_m3"] for f in sorted(hulls)}})
     entry = state.get("stages", {}).get("fit", {})
-    if entry.get("key") == key and _finished(folder, frame_ids) and not config.overwrite:
+    if entry.get("key") == key and _finished(folder, recording["frame_ids"]) and not config.overwrite:
         return
     if entry and entry.get("settings_key") != settings_key and not config.overwrite:
         raise UserError(
-            f"{folder.root}: holds a fit of body '{entry.get('body')}' with other settings; "
-            "add --overwrite to replace it, or choose another --out"
+            f"{folder.root}: holds a fit of body '{entry.get('body')}' made with other settings "
+            f"({entry.get('settings_key')}, asked for: body '{config.body}', {settings_key}); "
+            f"to replace it: bodyhull fit {folder.root} --body {config.body} --overwrite"
         )
     started = time.perf_counter()
+    state["configuration"] |= {k: config.as_dict()[k] for k in config.fit_settings()}
+    folder.write_state(state)
     folder.update_stage(
-        "fit", key="", settings_key=settings_key, body=config.body, body_hash=model.content_hash, settings=asdict(settings)
+        "fit",
+        key="",
+        settings_key=settings_key,
+        body=config.body,
+        body_hash=model.content_hash,
+        settings=asdict(settings),
     )
     fitter, finder = Fitter.of(model), _finder(model)
     world_from_body = recording_from_body(np.asarray(recording["up"]))
     scans = {
-        k: scan_in_body_frame(load_hull_scan(folder.hull(k), settings.n_points, settings.seed), world_from_body)
+        k: scan_in_body_frame(
+            load_hull_scan(folder.hull(k), settings.n_points, settings.seed), world_from_body
+        )
         for k in tqdm(frame_ids, desc="read hulls", unit="frame", leave=False)
     }
     keypoints = _keypoints(config, frame_ids, world_from_body) if config.keypoints is not None else {}
     alignments = _align(folder, fitter, finder, scans, keypoints, settings, settings_key, config.overwrite)
+    if all(a.status == "failed" for a in alignments):
+        raise UserError(f"{folder.root}: no frame could be aligned; {alignments[0].message}")
     fusion = fuse(fitter, alignments, settings)
-    _save_fusion(folder, model, fusion)
+    _save_fusion(folder, model, fusion, world_from_body)
     with tqdm(total=len(alignments), desc="track", unit="frame") as bar:
-        track = track_sequence(fitter, finder, fusion, alignments, scans, settings, lambda frame: bar.update())
+        track = track_sequence(
+            fitter,
+            finder,
+            fusion,
+            alignments,
+            scans,
+            settings,
+            report=lambda frame: bar.update(),
+            container_of=lambda frame_id: _container(folder.hull(frame_id), world_from_body),
+        )
+    track = [*track, *_without_hull(hulls, fusion)]
+    track.sort(key=lambda frame: frame.frame_id)
     _save_track(folder, fitter, fusion, track, world_from_body)
     for frame in track:
         if frame.message:
@@ -97,6 +136,33 @@ def fit_stage(config: RunConfig, settings: FitSettings | None = None) -> None:
             for f in track
         },
     )
+
+
+def _without_hull(hulls: dict[str, Any], fusion: FusionShape) -> list[TrackedFrame]:
+    """The frames whose hull failed: kept in the track, without a pose (NaN), with the hull's own sentence."""
+    lost = np.full_like(fusion.template, np.nan)
+    pose, shift = np.full_like(fusion.joints, np.nan), np.full(3, np.nan)
+    return [
+        TrackedFrame(
+            int(name), BodyState(lost, pose, shift, fusion.betas), np.inf, "failed", entry["problems"][-1]
+        )
+        for name, entry in hulls.items()
+        if entry["status"] == "failed"
+    ]
+
+
+def keypoints_print(folder: Path | None) -> str | None:
+    """A short hash over names, sizes and times of all files of a keypoints folder."""
+    if folder is None:
+        return None
+    files = sorted(p for p in folder.rglob("*.json") if p.is_file())
+    return digest([(str(p.relative_to(folder)), p.stat().st_size, p.stat().st_mtime_ns) for p in files])
+
+
+def _container(path: Path, world_from_body: np.ndarray) -> Container:
+    """The hull that a frame's body has to stay inside of, in the body's frame."""
+    vertices, faces = load_mesh(path)
+    return Container.of(vertices @ world_from_body[:3, :3], faces)
 
 
 def _finder(model: BodyModel) -> PoseFinder:
@@ -146,7 +212,10 @@ def _align(
     overwrite: bool,
 ) -> list[Alignment]:
     """Alignments from disk where they are still valid, the rest made and written one by one."""
-    prints = {k: digest([settings_key, float(s.points.sum()), float(np.abs(s.points).sum())]) for k, s in scans.items()}
+    prints = {
+        k: digest([settings_key, float(s.points.sum()), float(np.abs(s.points).sum())])
+        for k, s in scans.items()
+    }
     done: dict[int, Alignment] = {}
     if not overwrite:
         for k in scans:
@@ -166,7 +235,12 @@ def _align(
 
 
 def _state_arrays(state: BodyState) -> dict[str, np.ndarray]:
-    return {"template": state.template, "pose": state.pose, "translation": state.translation, "betas": state.betas}
+    return {
+        "template": state.template,
+        "pose": state.pose,
+        "translation": state.translation,
+        "betas": state.betas,
+    }
 
 
 def _save_alignment(path: Path, alignment: Alignment, fingerprint: str) -> None:
@@ -197,18 +271,21 @@ def _load_alignment(path: Path, fingerprint: str) -> Alignment | None:
     )
 
 
-def _save_fusion(folder: RunFolder, model: BodyModel, fusion: FusionShape) -> None:
+def _save_fusion(
+    folder: RunFolder, model: BodyModel, fusion: FusionShape, world_from_body: np.ndarray
+) -> None:
     save_arrays(
         folder.fusion,
         template=fusion.template,
         betas=fusion.betas,
         joints=fusion.joints,
         spread=fusion.spread,
+        fit_scale=fusion.fit_scale,
         faces=model.faces,
         body=model.name,
         body_hash=model.content_hash,
     )
-    save_mesh(folder.fusion_mesh, fusion.template, model.faces)
+    save_mesh(folder.fusion_mesh, apply(world_from_body, fusion.template), model.faces)
 
 
 def load_fusion(folder: RunFolder) -> FusionShape:
@@ -216,11 +293,17 @@ def load_fusion(folder: RunFolder) -> FusionShape:
     found = load_arrays(folder.fusion)
     if found is None:
         raise UserError(f"{folder.fusion}: missing or damaged; run: bodyhull fit {folder.root}")
-    return FusionShape(found["template"], found["betas"], found["joints"], found["spread"])
+    return FusionShape(
+        found["template"], found["betas"], found["joints"], found["spread"], found["fit_scale"]
+    )
 
 
 def _save_track(
-    folder: RunFolder, fitter: Fitter, fusion: FusionShape, track: list[TrackedFrame], world_from_body: np.ndarray
+    folder: RunFolder,
+    fitter: Fitter,
+    fusion: FusionShape,
+    track: list[TrackedFrame],
+    world_from_body: np.ndarray,
 ) -> None:
     for frame in track:
         path = folder.mesh(frame.frame_id)

@@ -1,6 +1,7 @@
 """The run folder: where every stage writes, and `run.json`, which remembers what has been done with what.
 
-Every file is written under a temporary name in its own folder and then renamed, so that a killed run leaves no half file.
+Every file is written under a temporary name in its own folder and then renamed, so that a killed run leaves
+no half file.
 """
 
 from __future__ import annotations
@@ -15,6 +16,20 @@ from typing import Any
 import numpy as np
 
 from bodyhull.errors import UserError
+
+#: Every file that a stage may leave in a run folder, besides run.json.
+OWN_FILES = (
+    "capture/rig.json",
+    "hull/[0-9][0-9][0-9][0-9][0-9][0-9]*.ply",
+    "fit/alignments/*.npz",
+    "fit/fusion.npz",
+    "fit/fusion.ply",
+    "fit/track.npz",
+    "fit/meshes/[0-9][0-9][0-9][0-9][0-9][0-9]*.ply",
+    "render/overlay/*.mp4",
+    "render/report.html",
+    "evaluate/errors.json",
+)
 
 
 @dataclass(frozen=True)
@@ -43,7 +58,7 @@ class RunFolder:
 
     @property
     def fusion_mesh(self) -> Path:
-        """The fusion shape, zero pose, y up."""
+        """The fusion shape in the zero pose, turned to the recording's up axis."""
         return self.root / "fit" / "fusion.ply"
 
     @property
@@ -74,22 +89,40 @@ class RunFolder:
         """Errors against the truth."""
         return self.root / "evaluate" / "errors.json"
 
-    # ---- run.json -------------------------------------------------------------------------------------------------
     def read_state(self) -> dict[str, Any]:
         """Contents of run.json; empty if there is none yet."""
         try:
-            return json.loads(self.state_file.read_text())
+            state = json.loads(self.state_file.read_text())
+            if not isinstance(state, dict):
+                raise ValueError(f"a {type(state).__name__} where an object is due")
         except FileNotFoundError:
             return {}
-        except (OSError, json.JSONDecodeError) as error:
-            raise UserError(f"{self.state_file}: cannot be read ({error}); choose another --out or use --overwrite") from error
+        except (OSError, ValueError) as error:
+            raise UserError(
+                f"{self.state_file}: cannot be read ({error}); choose another --out or use --overwrite"
+            ) from error
+        return state
 
     def require_state(self) -> dict[str, Any]:
         """Contents of run.json, which must exist."""
         state = self.read_state()
         if not state:
-            raise UserError(f"{self.root}: no run.json there; make the run first: bodyhull carve RECORDING --out {self.root}")
+            raise UserError(
+                f"{self.root}: no run.json there; make the run first: "
+                f"bodyhull carve RECORDING --out {self.root}"
+            )
         return state
+
+    def stage(self, name: str) -> dict[str, Any]:
+        """What run.json knows of a stage; empty before its first run."""
+        return self.read_state().get("stages", {}).get(name, {})
+
+    def remove_results(self) -> None:
+        """Delete what earlier stages wrote here (only names that bodyhull writes), so that no result outlives
+        its input."""
+        for pattern in OWN_FILES:
+            for path in self.root.glob(pattern):
+                path.unlink(missing_ok=True)
 
     def write_state(self, state: dict[str, Any]) -> None:
         """Write run.json."""
@@ -105,7 +138,8 @@ class RunFolder:
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Call `write` on a temporary name beside `path`, then rename; a full disk leaves the old file as it was."""
+    """Call `write` on a temporary name beside `path`, then rename; a full disk leaves the old file as it
+    was."""
     temporary = path.with_name(f".{os.getpid()}.{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

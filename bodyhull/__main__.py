@@ -1,0 +1,6 @@
+"""`python -m bodyhull` is the command `bodyhull`."""
+
+from bodyhull.cli import main
+
+if __name__ == "__main__":
+    main()
