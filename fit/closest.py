@@ -8,6 +8,7 @@ float64, so that residuals and their derivatives agree to full precision.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -55,10 +56,8 @@ def vertex_areas(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3
     return np.bincount(faces.ravel(), np.repeat(area, 3), minlength=len(vertices))
 
 
-def nearest_triangles(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], points: Float[np.ndarray, "n 3"]
-) -> Int[np.ndarray, "n"]:
-    """Index of the face nearest to each point."""
+def search_scene(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Any:
+    """open3d's search structure over a mesh."""
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
@@ -66,6 +65,13 @@ def nearest_triangles(
         o3d.core.Tensor(np.ascontiguousarray(vertices, dtype=np.float32)),
         o3d.core.Tensor(np.ascontiguousarray(faces, dtype=np.uint32)),
     )
+    return scene
+
+
+def nearest_triangles(scene: Any, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
+    """Index of the face nearest to each point."""
+    import open3d as o3d
+
     found = scene.compute_closest_points(o3d.core.Tensor(np.ascontiguousarray(points, dtype=np.float32)))
     return found["primitive_ids"].numpy().astype(np.int64)
 
@@ -106,30 +112,45 @@ def barycentric_of_closest(
     return bary
 
 
-def closest_points(
-    vertices: Float[np.ndarray, "v 3"],
-    faces: Int[np.ndarray, "f 3"],
-    points: Float[np.ndarray, "n 3"],
-) -> ClosestPoints:
-    """Closest point of a closed, outward oriented mesh for every scan point.
+@dataclass(frozen=True)
+class Container:
+    """A mesh that stays as it is, ready for many searches: vertices (V 3) m, faces (F 3), unit normals (V 3)."""
 
-    The paper's indicator delta (inside or outside) comes from the angle between the surface normal and the vector
-    from the mesh to the scan point; interpolated vertex normals make it reliable at edges and vertices.
-    """
-    triangle_idx = nearest_triangles(vertices, faces, points)
-    triangles = faces[triangle_idx]
-    corners = vertices[triangles]
-    bary = barycentric_of_closest(corners, points)
-    foot = np.einsum("nc,nca->na", bary, corners)
-    normals = np.einsum("nc,nca->na", bary, vertex_normals(vertices, faces)[triangles])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    gap = points - foot
-    distance = np.linalg.norm(gap, axis=1)
-    sign = np.where((gap * normals).sum(1) < 0, -1.0, 1.0)
-    contact = distance < CONTACT_M
-    direction = np.where(
-        contact[:, None], normals, sign[:, None] * gap / np.maximum(distance, 1e-30)[:, None]
-    )
-    # In contact the signed distance is the component along the normal.
-    signed = np.where(contact, (gap * normals).sum(1), sign * distance)
-    return ClosestPoints(triangle_idx, bary, foot, normals, signed, direction)
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    normals: Float[np.ndarray, "v 3"]
+    scene: Any
+
+    @staticmethod
+    def of(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Container:
+        """Build the search structure."""
+        return Container(vertices, faces, vertex_normals(vertices, faces), search_scene(vertices, faces))
+
+    def closest(self, points: Float[np.ndarray, "n 3"]) -> ClosestPoints:
+        """Closest point of the closed, outward oriented mesh for every point.
+
+        The paper's indicator delta (inside or outside) comes from the angle between the surface normal and the vector
+        from the mesh to the point; interpolated vertex normals make it reliable at edges and vertices.
+        """
+        triangle_idx = nearest_triangles(self.scene, points)
+        triangles = self.faces[triangle_idx]
+        corners = self.vertices[triangles]
+        bary = barycentric_of_closest(corners, points)
+        foot = np.einsum("nc,nca->na", bary, corners)
+        normals = np.einsum("nc,nca->na", bary, self.normals[triangles])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        gap = points - foot
+        distance = np.linalg.norm(gap, axis=1)
+        along = (gap * normals).sum(1)
+        sign = np.where(along < 0, -1.0, 1.0)
+        contact = distance < CONTACT_M
+        direction = np.where(contact[:, None], normals, sign[:, None] * gap / np.maximum(distance, 1e-30)[:, None])
+        # In contact the signed distance is the component along the normal.
+        return ClosestPoints(triangle_idx, bary, foot, normals, np.where(contact, along, sign * distance), direction)
+
+
+def closest_points(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], points: Float[np.ndarray, "n 3"]
+) -> ClosestPoints:
+    """Closest point of a mesh that is searched once, as `Container.closest`."""
+    return Container.of(vertices, faces).closest(points)

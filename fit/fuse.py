@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_matrix
 
 from fit.align import Alignment
 from fit.closest import vertex_normals
@@ -28,12 +29,14 @@ class FusionShape:
     """T_Fu: template (V 3) m in the zero pose, betas of the model coupled to it, joints (J 3) m.
 
     spread (V): deviation of the unposed alignments along the normal, m (the paper's figure 2 colours by it).
+    fit_scale (V): factor on lambda_fit that was derived from it.
     """
 
     template: Float[np.ndarray, "v 3"]
     betas: Float[np.ndarray, "b"]
     joints: Float[np.ndarray, "j 3"]
     spread: Float[np.ndarray, "v"]
+    fit_scale: Float[np.ndarray, "v"]
 
 
 def lost_points(
@@ -47,6 +50,32 @@ def lost_points(
     median = np.median(offsets, axis=0)
     spread = 1.4826 * np.median(np.abs(offsets - median), axis=0)
     return offsets < median - np.maximum(clip_mad * spread, floor_m)
+
+
+def smoothed_over_mesh(
+    value: Float[np.ndarray, "v"], faces: Int[np.ndarray, "f 3"], rounds: int
+) -> Float[np.ndarray, "v"]:
+    """Repeated means over a vertex and its neighbours: after n rounds about sqrt(n) edges wide."""
+    n = len(value)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    adjacency = coo_matrix((np.ones(len(edges)), edges.T), shape=(n, n)).tocsr()
+    count = np.asarray(adjacency.sum(axis=1)).ravel() + 1.0
+    for _ in range(rounds):
+        value = (value + adjacency @ value) / count
+    return value
+
+
+def fit_scale_from_spread(
+    spread: Float[np.ndarray, "v"], faces: Int[np.ndarray, "f 3"], settings: FitSettings
+) -> Float[np.ndarray, "v"]:
+    """Factor on lambda_fit a vertex, from how much the cloth there moves about.
+
+    One constant makes bare or tight regions too thin and loosely covered ones too fat. Loose cloth moves: the spread of the
+    unposed alignments along the normal, pooled over the neighbourhood, grows with the thickness of what is worn.
+    """
+    pooled = np.sqrt(smoothed_over_mesh(spread**2, faces, settings.spread_rounds))
+    scale = (settings.spread_m / np.maximum(pooled, 1e-6)) ** settings.spread_power
+    return np.clip(scale, *settings.fit_scale_limits)
 
 
 def fuse(fitter: Fitter, alignments: Sequence[Alignment], settings: FitSettings) -> FusionShape:
@@ -70,6 +99,9 @@ def fuse(fitter: Fitter, alignments: Sequence[Alignment], settings: FitSettings)
         keep.ravel().astype(float),
         np.zeros(len(points), dtype=bool),
     )
+    spread = offsets.std(axis=0)
+    enough = len(good) >= 4
+    fit_scale = fit_scale_from_spread(spread, fitter.model.faces, settings) if enough else np.ones(len(spread))
     n_joints = len(fitter.model.parents)
     state = BodyState(fitter.shaped(betas), np.zeros((n_joints, 3)), np.zeros(3), betas)
     pose_size = 3 * (n_joints - 1)
@@ -81,6 +113,7 @@ def fuse(fitter: Fitter, alignments: Sequence[Alignment], settings: FitSettings)
             Unknowns(pose=False, translation=False),
             np.zeros(pose_size),
             np.zeros((pose_size, pose_size)),
+            fit_scale=fit_scale,
         )
         state = minimise(objective, state, settings.max_iterations, settings.relative_drop).state
-    return FusionShape(state.template, state.betas, fitter.joints(state.betas), offsets.std(axis=0))
+    return FusionShape(state.template, state.betas, fitter.joints(state.betas), spread, fit_scale)

@@ -27,13 +27,14 @@ class MeshPattern:
     """Sparsity of a (3V, 3V) matrix with 3x3 blocks on the vertices and edges of a mesh.
 
     indptr, indices: CSR structure; slot (F 81): where entry (corner p, axis r; corner q, axis c) of a triangle's
-    9x9 block is stored.
+    9x9 block is stored; diagonal (9V): where the entries of the vertices' own blocks are.
     """
 
     n_vertices: int
     indptr: Int[np.ndarray, "_"]
     indices: Int[np.ndarray, "nnz"]
     slot: Int[np.ndarray, "f 81"]
+    diagonal: Int[np.ndarray, "_"]
 
     @staticmethod
     def of(faces: Int[np.ndarray, "f 3"], n_vertices: int) -> MeshPattern:
@@ -46,9 +47,21 @@ class MeshPattern:
         unique, slot = np.unique(key, return_inverse=True)
         rows, indices = unique // size, unique % size
         indptr = np.searchsorted(rows, np.arange(size + 1))
+        own = 3 * np.arange(n_vertices)[:, None] + np.arange(3)
+        diagonal = np.searchsorted(unique, (own[:, :, None] * size + own[:, None, :]).ravel())
         return MeshPattern(
-            n_vertices, indptr.astype(np.int32), indices.astype(np.int32), slot.reshape(-1, 81).astype(np.int64)
+            n_vertices,
+            indptr.astype(np.int32),
+            indices.astype(np.int32),
+            slot.reshape(-1, 81).astype(np.int64),
+            diagonal,
         )
+
+    def with_vertex_blocks(self, matrix: csr_matrix, blocks: Float[np.ndarray, "v 3 3"]) -> csr_matrix:
+        """The matrix with a 3x3 block added on every vertex's diagonal."""
+        data = matrix.data.copy()
+        data[self.diagonal] += blocks.reshape(-1)
+        return self.matrix(data)
 
     def matrix(self, data: Float[np.ndarray, "nnz"]) -> csr_matrix:
         """The CSR matrix with these values."""

@@ -14,7 +14,8 @@ class StageWeights:
     """One objective: which terms, how strong.
 
     cloth: treat every point as cloth (outside + fit) instead of as skin; sigma_m: Geman-McClure scale of skin or fit;
-    fit: lambda_fit / lambda_outside; outside_m: Huber scale of the outside term; coupling: lambda_cpl; tether: absolute
+    fit: lambda_fit / lambda_outside; outside_m: Huber scale of the outside term; inside, inside_m, margin_m: weight a
+    vertex, Huber scale and depth to reach of keeping the body inside a closed scan; coupling: lambda_cpl; tether: absolute
     pull of the template to its target; pose_prior, shape_prior: of the Gaussian priors; gate: whether points facing away
     from the body's surface are ignored.
     """
@@ -23,6 +24,9 @@ class StageWeights:
     sigma_m: float
     fit: float = 0.0
     outside_m: float = 0.006
+    inside: float = 0.0
+    inside_m: float = 0.01
+    margin_m: float = 0.0
     coupling: float = 0.0
     tether: float = 0.0
     pose_prior: float = 1e-3
@@ -50,10 +54,20 @@ class FitSettings:
         StageWeights(cloth=True, sigma_m=0.02, fit=0.03, coupling=5.0, tether=1e-3, gate=False),
         StageWeights(cloth=True, sigma_m=0.02, fit=0.03, coupling=0.1, tether=1e-3, gate=False),
     )
-    #: Tracking: the pose follows the scan a little more willingly than the shape does.
-    track_pose: StageWeights = field(default_factory=lambda: StageWeights(cloth=True, sigma_m=0.05, fit=0.1))
-    track_joint: StageWeights = field(
-        default_factory=lambda: StageWeights(cloth=True, sigma_m=0.02, fit=0.015, coupling=1.0, tether=1e-3)
+    #: Tracking. Cloth drags a pose less when it is taken as skin on all sides (fit 1, the same everywhere) than when the body
+    #: hangs on its tightest regions; the template then settles with the pose held.
+    track_pose: StageWeights = field(
+        default_factory=lambda: StageWeights(cloth=True, sigma_m=0.05, fit=1.0, inside=1.0)
     )
+    track_template: StageWeights = field(
+        default_factory=lambda: StageWeights(
+            cloth=True, sigma_m=0.02, fit=0.015, coupling=0.3, tether=1e-3, inside=5.0, margin_m=0.0005
+        )
+    )
+    #: lambda_fit is multiplied by (spread_m / spread)^spread_power a vertex, within these limits.
+    spread_m: float = 0.003
+    spread_power: float = 3.0
+    spread_rounds: int = 15
+    fit_scale_limits: tuple[float, float] = (0.01, 20.0)
     max_iterations: int = 15
     relative_drop: float = 5e-3

@@ -8,7 +8,7 @@ coupling * L + diag(trace H_ii / 3) + tether for the template and the dense bloc
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -18,7 +18,7 @@ from scipy.sparse.linalg import splu
 
 from fit import energy as terms
 from fit.body.model import BodyModel
-from fit.closest import ClosestPoints, closest_points, vertex_normals
+from fit.closest import ClosestPoints, Container, closest_points, vertex_normals
 from fit.normal_equations import MeshPattern, accumulate, edge_laplacian
 from fit.settings import StageWeights
 from fit.state import BodyState
@@ -145,7 +145,8 @@ class Objective:
     """The single-frame objective E(T, M(beta, 0), pose; scan) for one scan and one set of weights.
 
     target: what E_cpl pulls the template to: None couples to M(beta, 0) (paper 4.1), a fixed template (V 3) couples to
-    that (paper 4.3). joints: fixed joints (J 3), or None for J(beta). pose_mean, pose_precision: of the Gaussian pose prior
+    that (paper 4.3). fit_scale (V): factor on lambda_fit a vertex of the body. container: the closed surface the body must
+    stay inside of. joints: fixed joints (J 3), or None for J(beta). pose_mean, pose_precision: of the Gaussian pose prior
     over all joints but the root.
     """
 
@@ -157,6 +158,20 @@ class Objective:
     pose_precision: Float[np.ndarray, "m m"]
     target: Float[np.ndarray, "v 3"] | None = None
     joints: Float[np.ndarray, "j 3"] | None = None
+    fit_scale: Float[np.ndarray, "v"] | None = None
+    container: Container | None = None
+
+    def container_terms(
+        self, vertices: Float[np.ndarray, "v 3"]
+    ) -> tuple[float, ClosestPoints, Float[np.ndarray, "v"]] | None:
+        """E_inside: vertices outside a closed scan (a visual hull contains the person) are drawn in."""
+        if self.container is None or self.weights.inside == 0.0:
+            return None
+        closest = self.container.closest(vertices)
+        depth = closest.distance + self.weights.margin_m
+        energy, weight = terms.huber(depth, self.weights.inside_m)
+        scale = self.weights.inside * (depth > 0)
+        return float((scale * energy).sum()), replace(closest, distance=depth), scale * weight
 
     def point_terms(self, closest: ClosestPoints) -> terms.PerPoint:
         """Energy and weight of every scan point: skin, or outside + fit."""
@@ -171,8 +186,12 @@ class Objective:
             return scale * skin_energy, scale * skin_weight
         outside_energy, outside_weight = terms.outside(d, w.outside_m)
         fit_energy, fit_weight = terms.fit(d, w.sigma_m)
-        energy = outside_energy + w.fit * fit_energy
-        weight = outside_weight + w.fit * fit_weight
+        fit = np.full(len(d), w.fit)
+        if self.fit_scale is not None:
+            corners = self.fitter.model.faces[closest.triangle_idx]
+            fit = fit * (closest.barycentric * self.fit_scale[corners]).sum(1)
+        energy = outside_energy + fit * fit_energy
+        weight = outside_weight + fit * fit_weight
         if self.scan.is_skin.any():
             energy = np.where(self.scan.is_skin, skin_energy, energy)
             weight = np.where(self.scan.is_skin, skin_weight, weight)
@@ -199,15 +218,21 @@ class Objective:
         closest = closest_points(vertices, self.fitter.model.faces, self.scan.points)
         point_energy, weight = self.point_terms(closest)
         hessian, rhs = accumulate(self.fitter.pattern, self.fitter.model.faces, closest, weight)
-        return _Linearised(
-            float(point_energy.sum()) + self.prior_energy(state), hessian, rhs, rotations, jacobian
-        )
+        energy = float(point_energy.sum()) + self.prior_energy(state)
+        held = self.container_terms(vertices)
+        if held is not None:
+            energy += held[0]
+            blocks = held[2][:, None, None] * held[1].direction[:, :, None] * held[1].direction[:, None, :]
+            hessian = self.fitter.pattern.with_vertex_blocks(hessian, blocks)
+            rhs = rhs - (held[2] * held[1].distance)[:, None] * held[1].direction
+        return _Linearised(energy, hessian, rhs, rotations, jacobian)
 
     def energy(self, state: BodyState) -> float:
         """E alone."""
         vertices = self.fitter.posed(state, self.joints)
         closest = closest_points(vertices, self.fitter.model.faces, self.scan.points)
-        return float(self.point_terms(closest)[0].sum()) + self.prior_energy(state)
+        held = self.container_terms(vertices)
+        return float(self.point_terms(closest)[0].sum()) + self.prior_energy(state) + (held[0] if held else 0.0)
 
     # ---- steps ----------------------------------------------------------------------------------------------------
     def _active(self) -> Int[np.ndarray, "a"]:

@@ -9,12 +9,17 @@ import numpy as np
 from jaxtyping import Float
 
 from fit.align import Alignment, as_scan_points, mean_distance
-from fit.fuse import FusionShape
+from fit.closest import Container
+from fit.fuse import FusionShape, smoothed_over_mesh
 from fit.initialise import PoseFinder
 from fit.settings import FitSettings
 from fit.solver import Fitter, Objective, Unknowns, minimise
 from fit.state import BodyState
 from hull.scan import Scan
+
+
+#: How far outside the hull a vertex is brought back from, how deep inside it goes, and in how many rounds.
+REACH_M, SKIN_DEPTH_M, HOLD_ROUNDS = 0.03, 0.0003, 6
 
 
 @dataclass(frozen=True)
@@ -29,23 +34,65 @@ class TrackedFrame:
 
 
 def track_frame(
-    fitter: Fitter, finder: PoseFinder, fusion: FusionShape, alignment: Alignment, scan: Scan, settings: FitSettings
+    fitter: Fitter,
+    finder: PoseFinder,
+    fusion: FusionShape,
+    alignment: Alignment,
+    scan: Scan,
+    settings: FitSettings,
+    container: Container | None = None,
 ) -> BodyState:
-    """Pose first with the fusion shape as it is, then pose and template together, coupled to the fusion shape."""
+    """Pose first with the fusion shape as it is, then the template, coupled to the fusion shape.
+
+    container: the closed visual hull of the frame, if there is one: it contains the person, so the body stays inside.
+    """
     state = BodyState(fusion.template, alignment.state.pose, alignment.state.translation, fusion.betas)
     points = as_scan_points(scan)
-    for weights, template in ((settings.track_pose, False), (settings.track_joint, True)):
+    stages = (
+        (settings.track_pose, Unknowns(template=False, betas=False), None),
+        (settings.track_template, Unknowns(pose=False, translation=False, betas=False), fusion.fit_scale),
+    )
+    for weights, unknowns, fit_scale in stages:
         objective = Objective(
             fitter,
             points,
             weights,
-            Unknowns(template=template, betas=False),
+            unknowns,
             finder.prior.mean,
             finder.prior.precision,
             target=fusion.template,
             joints=fusion.joints,
+            fit_scale=fit_scale,
+            container=container,
         )
         state = minimise(objective, state, settings.max_iterations, settings.relative_drop).state
+    if container is not None:
+        state = held_inside(fitter, fusion, state, container)
+    return state
+
+
+def held_inside(fitter: Fitter, fusion: FusionShape, state: BodyState, container: Container) -> BodyState:
+    """The same body with the vertices that still lie outside the hull moved just inside it, their neighbours along.
+
+    A visual hull contains the person by construction, so nothing true is lost. Vertices farther out than REACH_M belong to
+    something that the hull lacks (a part hidden from a camera by an error in its mask) and are left alone.
+    """
+    faces = fitter.model.faces
+    for round_idx in range(HOLD_ROUNDS):
+        vertices, rotations, _ = fitter.linearised(state, fusion.joints)
+        closest = container.closest(vertices)
+        beyond = (closest.distance > 0) & (closest.distance < REACH_M)
+        if not beyond.any():
+            break
+        depth = np.where(beyond, closest.distance + SKIN_DEPTH_M, 0.0)
+        move = -depth[:, None] * closest.direction
+        if round_idx < HOLD_ROUNDS - 2:  # at first softly, so that no dent stands alone; at last exactly
+            shared = [smoothed_over_mesh(move[:, axis], faces, 2) for axis in range(3)]
+            share = smoothed_over_mesh(beyond.astype(float), faces, 2)
+            move = np.where(beyond[:, None], move, np.stack(shared, axis=1) / np.maximum(share, 0.3)[:, None])
+        # The blended rotations turn template moves into posed ones; solve for the template's.
+        step = np.linalg.solve(rotations, move[:, :, None])[:, :, 0]
+        state = state.moved(template=state.template + step)
     return state
 
 
@@ -57,6 +104,7 @@ def track_sequence(
     scan_of: Callable[[int], Scan] | Mapping[int, Scan],
     settings: FitSettings,
     report: Callable[[TrackedFrame], None] = lambda frame: None,
+    container_of: Callable[[int], Container | None] = lambda frame_id: None,
 ) -> list[TrackedFrame]:
     """Track all aligned frames; each starts from its alignment's pose. A failed alignment stays failed, with its reason."""
     done = []
@@ -66,7 +114,8 @@ def track_sequence(
         else:
             scan = scan_of[alignment.frame_id] if isinstance(scan_of, Mapping) else scan_of(alignment.frame_id)
             try:
-                state = track_frame(fitter, finder, fusion, alignment, scan, settings)
+                container = container_of(alignment.frame_id)
+                state = track_frame(fitter, finder, fusion, alignment, scan, settings, container)
                 distance = mean_distance(fitter.posed(state, fusion.joints), fitter.model.faces, scan.points)
                 frame = TrackedFrame(alignment.frame_id, state, distance, alignment.status, alignment.message)
             except (FloatingPointError, np.linalg.LinAlgError) as error:
