@@ -166,7 +166,8 @@ def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
     import zipfile
 
     try:
-        with np.load(path, allow_pickle=False) as data:
+        # numpy leaves a file that it opened itself open when the archive is damaged
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
             return {key: data[key] for key in data.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile):
         return None

@@ -1,0 +1,129 @@
+"""The command line as the README tells it: names, defaults, help, awkward values."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import bodyhull
+from bodyhull import cli
+from bodyhull.config import RunConfig
+from tests.command_line import call
+
+Capture = pytest.CaptureFixture[str]
+RUN = (
+    "RECORDING --out --sequence --body --calibration --frames --voxel-mm --units --up --background "
+    "--keypoints --overwrite"
+)
+COMMANDS = {
+    "run": RUN,
+    "carve": RUN,
+    "fit": "RUN --body --keypoints --overwrite",
+    "overlay": "RUN --overwrite",
+    "evaluate": "RUN --truth",
+    "synth": "OUT --cameras --size --layout --frames --motion --garment --seed --body --overwrite",
+    "doctor": "",
+    "demo": "--out --seed --motion --garment",
+}
+
+
+@pytest.fixture
+def taken(monkeypatch: pytest.MonkeyPatch) -> list[object]:
+    """Commands that would have been carried out."""
+    seen: list[object] = []
+
+    def note(command: object) -> int:
+        seen.append(command)
+        return 0
+
+    monkeypatch.setattr(cli, "perform", note)
+    return seen
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_names_every_option(command: str, capsys: Capture) -> None:
+    said = call(capsys, command, "--help")
+    assert said.code == 0
+    documented = set(COMMANDS[command].split())
+    for name in documented:
+        assert re.search(rf"(^|[\s│]){re.escape(name)}\b", said.out, re.MULTILINE), (
+            f"{name} is missing from the help"
+        )
+    found = set(re.findall(r"^[│ ]{1,3}(--[a-z][a-z-]*)", said.out, re.MULTILINE)) - {"--help"}
+    assert found == {name for name in documented if name.startswith("--")}
+
+
+def test_help_lists_the_commands(capsys: Capture) -> None:
+    said = call(capsys, "--help")
+    assert said.code == 0
+    assert all(re.search(rf"^[│ •]+{name} ", said.out, re.MULTILINE) for name in COMMANDS), said.out
+    assert bodyhull.__doc__ is not None and bodyhull.__doc__.split(":")[0] in said.out
+
+
+def test_options_arrive_in_the_configuration(taken: list[object], capsys: Capture) -> None:
+    call(
+        capsys, "run", "rec", "--out", "there", "--sequence", "walk", "--body", "free:male",
+        "--calibration", "c.json", "--frames", "0:100:5", "--voxel-mm", "5", "--units", "mm", "--up", "-y",
+        "--background", "plates", "--keypoints", "openpose", "--overwrite",
+    )  # fmt: skip
+    assert taken == [
+        cli.Run(
+            Path("rec"), Path("there"), "walk", "free:male", Path("c.json"), "0:100:5", 5.0, "mm", "-y",
+            Path("plates"), Path("openpose"), True,
+        )
+    ]  # fmt: skip
+
+
+def test_defaults_are_stated_once(taken: list[object], capsys: Capture) -> None:
+    call(capsys, "carve", "rec", "--out", "there")
+    config = RunConfig(Path("rec"), Path("there"))
+    assert vars(taken[0]) == vars(config)
+    assert (config.body, config.voxel_mm, config.units, config.up) == ("free:neutral", 8.0, "auto", "auto")
+
+
+@pytest.mark.parametrize("axis", ["auto", "x", "y", "z", "-x", "-y", "-z"])
+def test_an_axis_may_begin_with_a_sign(axis: str, taken: list[object], capsys: Capture) -> None:
+    call(capsys, "run", "rec", "--up", axis, "--out", "there")
+    call(capsys, "run", f"--up={axis}", "rec", "--out", "there")
+    assert [command.up for command in taken] == [axis, axis]  # type: ignore[attr-defined]
+
+
+def test_frames_may_begin_with_a_sign(taken: list[object], capsys: Capture) -> None:
+    call(capsys, "run", "rec", "--frames", "-10::2", "--out", "there")
+    assert taken[0].frames == "-10::2"  # type: ignore[attr-defined]
+    assert cli.joined_signs(["--up", "--out", "a"]) == ["--up", "--out", "a"], "an option is no value"
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        ((), "run|synth"),
+        (("walk",), "walk"),
+        (("run", "rec"), "--out"),
+        (("run", "--out", "there"), "RECORDING"),
+        (("run", "rec", "--out", "there", "--units", "inch"), "inch"),
+        (("run", "rec", "--out", "there", "--up", "w"), "w"),
+        (("run", "rec", "--out", "there", "--voxel-mm", "fine"), "fine"),
+        (("run", "rec", "--out", "there", "--sped-up"), "--sped-up"),
+        (("evaluate", "there"), "--truth"),
+    ],
+)
+def test_misuse_is_told_with_code_two(words: tuple[str, ...], what: str, capsys: Capture) -> None:
+    said = call(capsys, *words)
+    assert said.code == 2
+    assert re.search(what, said.err + said.out) and "Traceback" not in said.err
+
+
+def test_the_version_is_in_one_place() -> None:
+    root = Path(__file__).parent.parent
+    changelog = (root / "CHANGELOG.md").read_text("utf-8")
+    newest = re.search(r"^## (\S+), \d{4}-\d{2}-\d{2}$", changelog, re.MULTILINE)
+    assert newest is not None and newest[1] == bodyhull.__version__
+
+
+def test_the_readme_tells_every_command_and_option() -> None:
+    readme = (Path(__file__).parent.parent / "README.md").read_text("utf-8")
+    for command, options in COMMANDS.items():
+        assert f"bodyhull {command}" in readme, command
+        missing = [name for name in options.split() if f"{name}" not in readme]
+        assert not missing, f"the README does not tell {missing} of {command}"
