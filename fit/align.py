@@ -1,7 +1,8 @@
-"""Cloth alignments (paper section 4.2): every scan registered by a template of its own, as if it were all skin.
+"""Cloth alignments (paper section 4.2): every scan registered by a template of its own, as if it were all
+skin.
 
-The pose is found first (initialise.py), then pose and shape alone are fitted, then the template joins them. What is left
-in the unposed templates is cloth, with the motion factored out.
+The pose is found first (initialise.py), then pose and shape alone are fitted, then the template joins them.
+What is left in the unposed templates is cloth, with the motion factored out.
 """
 
 from __future__ import annotations
@@ -27,8 +28,9 @@ SUSPICIOUS_M = 0.03
 class Alignment:
     """One aligned frame, in the body's upright frame.
 
-    state.template is the unposed clothed template; score: coarse distance of the starting pose, m; distance_m: mean distance
-    of the scan to the alignment; status: "ok", "suspect" or "failed", with `message` saying why.
+    state.template is the unposed clothed template; score: coarse distance of the starting pose, m;
+    distance_m: mean distance of the scan to the alignment; status: "ok", "suspect" or "failed", with
+    `message` saying why.
     """
 
     frame_id: int
@@ -54,8 +56,8 @@ def align_frame(
 ) -> BodyState:
     """Best alignment of one scan from one or more starting poses.
 
-    All starts go through the pose-and-shape stage; the one with the lowest energy gets the template. joints: hold
-    the skeleton fixed (J 3) instead of letting it follow the betas.
+    All starts go through the pose-and-shape stage; the one with the lowest energy gets the template. joints:
+    hold the skeleton fixed (J 3) instead of letting it follow the betas.
     """
     best: BodyState | None = None
     best_energy = np.inf
@@ -64,7 +66,13 @@ def align_frame(
         energy = np.inf
         for weights in settings.align_pose:
             objective = Objective(
-                fitter, scan, weights, Unknowns(template=False), finder.prior.mean, finder.prior.precision, joints=joints
+                fitter,
+                scan,
+                weights,
+                Unknowns(template=False),
+                finder.prior.mean,
+                finder.prior.precision,
+                joints=joints,
             )
             outcome = minimise(objective, state, settings.max_iterations, settings.relative_drop)
             state, energy = outcome.state, outcome.energies[-1]
@@ -89,9 +97,9 @@ def align_sequence(
 ) -> list[Alignment]:
     """Align the frames in order: (frame_id, scan in the body's frame or None, keypoints or None).
 
-    Each frame starts from the previous pose; where that scores clearly worse than the best frame so far, or there is none,
-    the pose is found anew. A frame without a scan is passed over; one that raises is kept, marked "failed". Frames of
-    `done_before` are taken as they are; `report` hears of the others.
+    Each frame starts from the previous pose; where that scores clearly worse than the best frame so far, or
+    there is none, the pose is found anew. A frame without a scan is passed over; one that raises is kept,
+    marked "failed". Frames of `done_before` are taken as they are; `report` hears of the others.
     """
     from threadpoolctl import threadpool_limits
 
@@ -133,7 +141,10 @@ def _align_in_order(
             distance = mean_distance(posed, fitter.model.faces, scan.points)
         except (FloatingPointError, np.linalg.LinAlgError) as error:
             rest = BodyState(
-                fitter.shaped(np.zeros(finder.n_model_betas)), finder.mean_pose(), np.zeros(3), np.zeros(finder.n_model_betas)
+                fitter.shaped(np.zeros(finder.n_model_betas)),
+                finder.mean_pose(),
+                np.zeros(3),
+                np.zeros(finder.n_model_betas),
             )
             alignment = Alignment(frame_id, rest, np.inf, np.inf, "failed", f"frame {frame_id:06d}: {error}")
             done.append(alignment)
@@ -146,7 +157,8 @@ def _align_in_order(
             alignment = replace(
                 alignment,
                 status="suspect",
-                message=f"frame {frame_id:06d}: the alignment stays {1e3 * distance:.0f} mm from the scan on average",
+                message=f"frame {frame_id:06d}: the alignment stays {1e3 * distance:.0f} mm from the scan "
+                "on average",
             )
         best_score = min(best_score, score)
         previous = CoarsePose(state.pose, state.translation, state.betas, score)
@@ -164,7 +176,8 @@ def starting_poses(
     previous_centroid: Float[np.ndarray, "3"],
     best_score: float,
 ) -> list[CoarsePose]:
-    """Where to start a frame: keypoints where given, else the previous pose, else (or when lost) the hull alone."""
+    """Where to start a frame: keypoints where given, else the previous pose, else (or when lost) the hull
+    alone."""
     starts: list[CoarsePose] = []
     betas = None if previous is None else previous.betas
     if keypoints is not None:

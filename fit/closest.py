@@ -1,8 +1,8 @@
 """Closest points of a scan on a moving body mesh, with the side on which each point lies.
 
 The paper's `dist(s, M)` (section 4.1): the closest primitive, triangle, edge or vertex. The search runs in
-open3d's ray-casting scene (Embree, float32); the closest point on the found triangle is then computed again in
-float64, so that residuals and their derivatives agree to full precision.
+open3d's ray-casting scene (Embree, float32); the closest point on the found triangle is then computed again
+in float64, so that residuals and their derivatives agree to full precision.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ class ClosestPoints:
     direction: Float[np.ndarray, "n 3"]
 
 
-def vertex_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v 3"]:
+def vertex_normals(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> Float[np.ndarray, "v 3"]:
     """Unit vertex normals, faces weighted by area."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     face_normals = np.cross(b - a, c - a)
@@ -62,8 +64,8 @@ def search_scene(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3
 
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(
-        o3d.core.Tensor(np.ascontiguousarray(vertices, dtype=np.float32)),
-        o3d.core.Tensor(np.ascontiguousarray(faces, dtype=np.uint32)),
+        o3d.core.Tensor.from_numpy(np.ascontiguousarray(vertices, dtype=np.float32)),
+        o3d.core.Tensor.from_numpy(np.ascontiguousarray(faces, dtype=np.uint32)),
     )
     return scene
 
@@ -72,7 +74,9 @@ def nearest_triangles(scene: Any, points: Float[np.ndarray, "n 3"]) -> Int[np.nd
     """Index of the face nearest to each point."""
     import open3d as o3d
 
-    found = scene.compute_closest_points(o3d.core.Tensor(np.ascontiguousarray(points, dtype=np.float32)))
+    found = scene.compute_closest_points(
+        o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, dtype=np.float32))
+    )
     return found["primitive_ids"].numpy().astype(np.int64)
 
 
@@ -81,8 +85,9 @@ def barycentric_of_closest(
 ) -> Float[np.ndarray, "n 3"]:
     """Barycentric coordinates of the closest point of each triangle to its point.
 
-    corners: (point, corner, axis). The point is projected on the plane; where that falls outside the triangle, the
-    nearest of the three edges decides (clamped to its ends), which covers edges and vertices alike.
+    corners: (point, corner, axis). The point is projected on the plane; where that falls outside the
+    triangle, the nearest of the three edges decides (clamped to its ends), which covers edges and vertices
+    alike.
     """
     a = corners[:, 0]
     ab, ac, ap = corners[:, 1] - a, corners[:, 2] - a, points - a
@@ -114,7 +119,8 @@ def barycentric_of_closest(
 
 @dataclass(frozen=True)
 class Container:
-    """A mesh that stays as it is, ready for many searches: vertices (V 3) m, faces (F 3), unit normals (V 3)."""
+    """A mesh that stays as it is, ready for many searches: vertices (V 3) m, faces (F 3), unit normals (V
+    3)."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -129,8 +135,9 @@ class Container:
     def closest(self, points: Float[np.ndarray, "n 3"]) -> ClosestPoints:
         """Closest point of the closed, outward oriented mesh for every point.
 
-        The paper's indicator delta (inside or outside) comes from the angle between the surface normal and the vector
-        from the mesh to the point; interpolated vertex normals make it reliable at edges and vertices.
+        The paper's indicator delta (inside or outside) comes from the angle between the surface normal and
+        the vector from the mesh to the point; interpolated vertex normals make it reliable at edges and
+        vertices.
         """
         triangle_idx = nearest_triangles(self.scene, points)
         triangles = self.faces[triangle_idx]
@@ -144,9 +151,13 @@ class Container:
         along = (gap * normals).sum(1)
         sign = np.where(along < 0, -1.0, 1.0)
         contact = distance < CONTACT_M
-        direction = np.where(contact[:, None], normals, sign[:, None] * gap / np.maximum(distance, 1e-30)[:, None])
+        direction = np.where(
+            contact[:, None], normals, sign[:, None] * gap / np.maximum(distance, 1e-30)[:, None]
+        )
         # In contact the signed distance is the component along the normal.
-        return ClosestPoints(triangle_idx, bary, foot, normals, np.where(contact, along, sign * distance), direction)
+        return ClosestPoints(
+            triangle_idx, bary, foot, normals, np.where(contact, along, sign * distance), direction
+        )
 
 
 def closest_points(

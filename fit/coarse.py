@@ -1,7 +1,8 @@
-"""A low-resolution body for finding the pose: some hundred vertices, linear skinning, analytic derivatives in numpy.
+"""A low-resolution body for finding the pose: some hundred vertices, linear skinning, analytic derivatives in
+numpy.
 
-Pose corrections are left out and normals turn with the blended bones: enough to come within centimetres of a hull, fast
-enough to try dozens of starting poses a frame.
+Pose corrections are left out and normals turn with the blended bones: enough to come within centimetres of a
+hull, fast enough to try dozens of starting poses a frame.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from fit.closest import vertex_areas, vertex_normals
 NORMAL_WEIGHT_M = 0.08
 #: The score's cut-off: a point farther than this says nothing about how far.
 SCORE_CUT_M = 0.10
-#: Share of the point-to-point part beside the point-to-plane part, for pairs found from the body and from the scan.
+#: Share of the point-to-point part beside the point-to-plane part, for pairs found from the body and from the
+#: scan.
 BODY_GLUE, SCAN_GLUE = 0.05, 0.4
 #: Radians that a joint may turn in one step.
 LARGEST_TURN = 0.6
@@ -29,7 +31,8 @@ LARGEST_TURN = 0.6
 
 @dataclass(frozen=True)
 class CoarsePose:
-    """pose (J 3) rad, translation (3) m, betas (B; only the first few are used), score m (lower is better)."""
+    """pose (J 3) rad, translation (3) m, betas (B; only the first few are used), score m (lower is
+    better)."""
 
     pose: Float[np.ndarray, "j 3"]
     translation: Float[np.ndarray, "3"]
@@ -52,7 +55,8 @@ class CoarseScan:
 
     @staticmethod
     def of(points: np.ndarray, normals: np.ndarray, n_points: int = 4000) -> CoarseScan:
-        """An even subset of an area-uniform scan: dense, so that a body point finds a scan point straight ahead of it."""
+        """An even subset of an area-uniform scan: dense, so that a body point finds a scan point straight
+        ahead of it."""
         keep = np.linspace(0, len(points) - 1, min(n_points, len(points))).astype(int)
         points, normals = points[keep], normals[keep]
         return CoarseScan(points, normals, cKDTree(np.hstack([points, NORMAL_WEIGHT_M * normals])))
@@ -130,7 +134,9 @@ class CoarseBody:
                 origin[j] = origin[parent] + world[parent] @ (joints[j] - joints[parent])
         offset = origin - np.einsum("jab,jb->ja", world, joints)
         # Where every bone alone would put every vertex, weighted: (n J 3).
-        by_bone = self.weights[:, :, None] * ((rest @ world.reshape(-1, 3).T).reshape(len(rest), n_joints, 3) + offset)
+        by_bone = self.weights[:, :, None] * (
+            (rest @ world.reshape(-1, 3).T).reshape(len(rest), n_joints, 3) + offset
+        )
         blended = (self.weights @ world.reshape(n_joints, 9)).reshape(-1, 3, 3)
         normals = np.einsum("nab,nb->na", blended, self.rest_normals)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
@@ -145,7 +151,9 @@ class CoarseBody:
         parent_frame = np.stack([np.eye(3) if p < 0 else posed.world[p] for p in self.parents])
         out = np.empty((n, 3, 3 * n_joints + 3 + self.n_betas))
         axes = parent_frame.transpose(0, 2, 1)  # (J, which axis, xyz)
-        out[:, :, : 3 * n_joints] = np.cross(axes[None], arm[:, :, None, :]).transpose(0, 3, 1, 2).reshape(n, 3, -1)
+        out[:, :, : 3 * n_joints] = (
+            np.cross(axes[None], arm[:, :, None, :]).transpose(0, 3, 1, 2).reshape(n, 3, -1)
+        )
         out[:, :, 3 * n_joints : 3 * n_joints + 3] = np.eye(3)
         # Betas move the vertex in its bones' frames, and the joints under it.
         shape = np.einsum("nab,nbk->nak", posed.blended, self.shape)
@@ -226,8 +234,8 @@ def refine(
 ) -> CoarsePose:
     """Gauss-Newton on symmetric nearest neighbours (and keypoints), sigma from coarse to fine.
 
-    Residuals are mostly along the scan's normals; Geman-McClure weights with the current sigma; pairs whose normals oppose
-    are left out. Returns the pose with its score against the scan (infinite without one).
+    Residuals are mostly along the scan's normals; Geman-McClure weights with the current sigma; pairs whose
+    normals oppose are left out. Returns the pose with its score against the scan (infinite without one).
     """
     at = start
     n, n_joints = body.n_surface, len(body.parents)
@@ -248,8 +256,9 @@ def refine(
                 agree = (posed.normals[vertex] * normal).sum(1) > 0.0
                 weight = agree * (sigma**2 / (sigma**2 + (gap**2).sum(1))) ** 2
                 weight = weight / len(weight) * 700.0
-                # From the body to the scan mostly along the normal, since sampling noise along the surface acts like
-                # glue; from the scan to the body in all directions, since that is what pulls limbs to full length.
+                # From the body to the scan mostly along the normal, since sampling noise along the surface
+                # acts like glue; from the scan to the body in all directions, since that is what pulls limbs
+                # to full length.
                 glue = np.repeat((BODY_GLUE, SCAN_GLUE), (n, len(body_idx)))[:, None, None]
                 metric = weight[:, None, None] * (
                     (1 - glue) * normal[:, :, None] * normal[:, None, :] + glue * np.eye(3)
@@ -281,7 +290,8 @@ def refine(
             hessian[np.diag_indices(size)] += 0.005
             step = cho_solve(cho_factor(hessian), rhs)
             turns = step[: 3 * n_joints].reshape(-1, 3)
-            # A joint that hardly any point holds would swing wildly: it is held back alone, not the whole step.
+            # A joint that hardly any point holds would swing wildly: it is held back alone, not the whole
+            # step.
             turns /= np.maximum(1.0, np.linalg.norm(turns, axis=1, keepdims=True) / LARGEST_TURN)
             pose = (Rotation.from_rotvec(turns) * Rotation.from_rotvec(at.pose)).as_rotvec()
             new_betas = at.betas.copy()

@@ -1,10 +1,10 @@
 """The terms of the single-frame objective, each a function citing its equation (paper section 4.1).
 
-Normalisation (the paper leaves it open): sums over the N scan points are multiplied by V / N, so that a weight means
-the same for any number of points and beside the coupling, which is a sum over mesh edges. Distances in metres.
-Geman-McClure is used in its scaled form, rho(d) = sigma^2 d^2 / (sigma^2 + d^2), which is d^2 near zero, so that the
-weights keep their meaning when sigma changes. Point terms return (energy, weight) a point: `weight` is the factor
-of d^2 in iteratively re-weighted least squares.
+Normalisation (the paper leaves it open): sums over the N scan points are multiplied by V / N, so that a
+weight means the same for any number of points and beside the coupling, which is a sum over mesh edges.
+Distances in metres. Geman-McClure is used in its scaled form, rho(d) = sigma^2 d^2 / (sigma^2 + d^2), which
+is d^2 near zero, so that the weights keep their meaning when sigma changes. Point terms return (energy,
+weight) a point: `weight` is the factor of d^2 in iteratively re-weighted least squares.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ def skin(signed_distance: Float[np.ndarray, "n"], sigma_m: float) -> PerPoint:
 def outside(signed_distance: Float[np.ndarray, "n"], delta_m: float) -> PerPoint:
     """E_outside: cloth points inside the body (delta_i = 1, negative distance) push the surface inwards.
 
-    Huber instead of the paper's square: one percent of points lost 20-60 mm inside the hull ruins a quadratic term.
+    Huber instead of the paper's square: one percent of points lost 20-60 mm inside the hull ruins a quadratic
+    term.
     """
     energy, weight = huber(signed_distance, delta_m)
     inside = signed_distance < 0
@@ -49,7 +50,9 @@ def fit(signed_distance: Float[np.ndarray, "n"], sigma_m: float) -> PerPoint:
     return geman_mcclure(signed_distance, sigma_m)
 
 
-def coupling(difference: Float[np.ndarray, "v 3"], laplacian: csr_matrix) -> tuple[float, Float[np.ndarray, "v 3"]]:
+def coupling(
+    difference: Float[np.ndarray, "v 3"], laplacian: csr_matrix
+) -> tuple[float, Float[np.ndarray, "v 3"]]:
     """E_cpl: edges of the template against the edges of its target; difference = T_Est - target.
 
     Returns the energy and half its gradient, L (T_Est - target).

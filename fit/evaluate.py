@@ -1,9 +1,9 @@
 """Errors of a result against the true naked body, by the paper's protocol and directly.
 
-Paper (section 6.2): pose the true template so that it fits the result best; then the distance from each true vertex to the
-result's surface. The pose is optimised inside the measure, so it scores shape. Direct: the true body of the same frame
-against the posed result, which scores pose and shape. Both in millimetres, over outer vertices of torso, arms, legs and
-neck, weighted by the area that belongs to each vertex.
+Paper (section 6.2): pose the true template so that it fits the result best; then the distance from each true
+vertex to the result's surface. The pose is optimised inside the measure, so it scores shape. Direct: the true
+body of the same frame against the posed result, which scores pose and shape. Both in millimetres, over outer
+vertices of torso, arms, legs and neck, weighted by the area that belongs to each vertex.
 """
 
 from __future__ import annotations
@@ -59,7 +59,8 @@ def summarise(signed_mm: Float[np.ndarray, "n"], weight: Float[np.ndarray, "n"])
 
 
 def signed_error_mm(truth: Float[np.ndarray, "n 3"], result: Surface) -> Float[np.ndarray, "n"]:
-    """Distance of true vertices to the result's surface in mm; positive where the truth lies inside the result."""
+    """Distance of true vertices to the result's surface in mm; positive where the truth lies inside the
+    result."""
     return -1e3 * closest_points(result.vertices, result.faces, truth).distance
 
 
@@ -94,7 +95,9 @@ def transfer_rig(
     """Give a true body the bones of a fitted one in the same pose: weights from the closest surface point."""
     closest = closest_points(body.vertices, body.faces, truth)
     corners = body.faces[closest.triangle_idx]
-    return Rig(np.einsum("nc,ncj->nj", closest.barycentric, body_weights[corners]), joints, np.asarray(parents))
+    return Rig(
+        np.einsum("nc,ncj->nj", closest.barycentric, body_weights[corners]), joints, np.asarray(parents)
+    )
 
 
 def pose_truth_to(
@@ -106,7 +109,8 @@ def pose_truth_to(
 ) -> Float[np.ndarray, "v 3"]:
     """The true body re-posed so that its scored vertices lie nearest to the result's surface (least squares).
 
-    Starts from the true body of the frame, whose pose is near; turns its joints and moves it, never its shape.
+    Starts from the true body of the frame, whose pose is near; turns its joints and moves it, never its
+    shape.
     """
     n_joints = len(rig.parents)
     area = vertex_areas(truth, truth_faces) * scored

@@ -23,7 +23,9 @@ def recording_from_body(up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
     return out
 
 
-def apply(transform: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+def apply(
+    transform: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*n 3"]
+) -> Float[np.ndarray, "*n 3"]:
     """Transform points (..., 3)."""
     return points @ transform[:3, :3].T + transform[:3, 3]
 

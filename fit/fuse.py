@@ -1,7 +1,7 @@
 """The fusion shape (paper section 4.2): one naked template inside all unposed clothed templates.
 
-The union of the unposed alignments is the fusion scan; since every frame carves away from the outside, the same objective
-in the zero pose, all points cloth, gives the person's shape.
+The union of the unposed alignments is the fusion scan; since every frame carves away from the outside, the
+same objective in the zero pose, all points cloth, gives the person's shape.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ def lost_points(
 ) -> Bool[np.ndarray, "t v"]:
     """Which unposed vertices lie implausibly far inside their fellows of the other frames.
 
-    offsets: along the common normal, positive outwards, m. Only inward outliers are dropped: they alone pull the
-    shape in, and the outside term has little resistance against them.
+    offsets: along the common normal, positive outwards, m. Only inward outliers are dropped: they alone pull
+    the shape in, and the outside term has little resistance against them.
     """
     median = np.median(offsets, axis=0)
     spread = 1.4826 * np.median(np.abs(offsets - median), axis=0)
@@ -65,16 +65,27 @@ def smoothed_over_mesh(
     return value
 
 
+def trust_in_spread(alignments: Sequence[Alignment], settings: FitSettings) -> float:
+    """How far the spread may be read as cloth, 0 to 1.
+
+    Hulls of few or badly calibrated cameras have phantom volume that comes and goes; the alignments then stay away from
+    their scans, and spread between them tells of the hulls, not of the clothes.
+    """
+    doubt = float(np.median([a.distance_m for a in alignments])) - settings.trusted_distance_m
+    return 1.0 / (1.0 + (max(doubt, 0.0) / settings.doubt_m) ** 2)
+
+
 def fit_scale_from_spread(
-    spread: Float[np.ndarray, "v"], faces: Int[np.ndarray, "f 3"], settings: FitSettings
+    spread: Float[np.ndarray, "v"], faces: Int[np.ndarray, "f 3"], trust: float, settings: FitSettings
 ) -> Float[np.ndarray, "v"]:
     """Factor on lambda_fit a vertex, from how much the cloth there moves about.
 
     One constant makes bare or tight regions too thin and loosely covered ones too fat. Loose cloth moves: the spread of the
-    unposed alignments along the normal, pooled over the neighbourhood, grows with the thickness of what is worn.
+    unposed alignments along the normal, pooled over the neighbourhood, grows with the thickness of what is worn. The
+    exponent is lowered where the spread cannot be trusted (`trust_in_spread`).
     """
     pooled = np.sqrt(smoothed_over_mesh(spread**2, faces, settings.spread_rounds))
-    scale = (settings.spread_m / np.maximum(pooled, 1e-6)) ** settings.spread_power
+    scale = (settings.spread_m / np.maximum(pooled, 1e-6)) ** (trust * settings.spread_power)
     return np.clip(scale, *settings.fit_scale_limits)
 
 
@@ -101,7 +112,9 @@ def fuse(fitter: Fitter, alignments: Sequence[Alignment], settings: FitSettings)
     )
     spread = offsets.std(axis=0)
     enough = len(good) >= 4
-    fit_scale = fit_scale_from_spread(spread, fitter.model.faces, settings) if enough else np.ones(len(spread))
+    fit_scale = np.ones(len(spread))
+    if enough:
+        fit_scale = fit_scale_from_spread(spread, fitter.model.faces, trust_in_spread(good, settings), settings)
     n_joints = len(fitter.model.parents)
     state = BodyState(fitter.shaped(betas), np.zeros((n_joints, 3)), np.zeros(3), betas)
     pose_size = 3 * (n_joints - 1)

@@ -1,7 +1,8 @@
 """The first pose, found with no help: from the hull alone, or from triangulated keypoints.
 
-Starting poses face eight directions; the best are kept, refined, and their arms tried anew in other configurations, since
-a lost arm (folded onto the trunk) is nearly the only way to fail. The paper used landmarks for this (section 5.1).
+Starting poses face eight directions; the best are kept, refined, and their arms tried anew in other
+configurations, since a lost arm (folded onto the trunk) is nearly the only way to fail. The paper used
+landmarks for this (section 5.1).
 """
 
 from __future__ import annotations
@@ -66,10 +67,13 @@ class PoseFinder:
         shift = 0.5 * (scan_low + scan_high) - 0.5 * (low + high)
         # Feet on the scan's lowest point, horizontally on its centroid: raised arms must not lift the body.
         centroid = scan.points.mean(0) - points.mean(0)
-        return CoarsePose(pose, np.array([centroid[0], 0.5 * (shift[1] + scan_low[1] - low[1]), centroid[2]]), betas)
+        return CoarsePose(
+            pose, np.array([centroid[0], 0.5 * (shift[1] + scan_low[1] - low[1]), centroid[2]]), betas
+        )
 
     def standing_betas(self, scan: CoarseScan) -> Float[np.ndarray, "b"]:
-        """The first coefficient set so that the body in the mean pose is as high as the scan (within 3 deviations)."""
+        """The first coefficient set so that the body in the mean pose is as high as the scan (within 3
+        deviations)."""
 
         def height(first: float) -> float:
             betas = np.zeros(self.n_model_betas)
@@ -83,16 +87,23 @@ class PoseFinder:
         return betas
 
     def from_hull(self, scan: CoarseScan, betas: np.ndarray | None = None) -> list[CoarsePose]:
-        """Hypotheses from the hull alone, best first. betas: of the same person in another frame, if known."""
+        """Hypotheses from the hull alone, best first. betas: of the same person in another frame, if
+        known."""
         starts = [np.zeros(self.n_model_betas), self.standing_betas(scan)] if betas is None else [betas]
         headings = 2.0 * np.pi * np.arange(N_HEADINGS) / N_HEADINGS
         tried = [self.facing(scan, heading, first) for heading in headings for first in starts]
-        for sigma, iterations, kept in ((0.3, 6, 2 * KEPT), (0.15, 6, KEPT), (0.08, 6, KEPT), (0.05, 6, KEPT)):
+        for sigma, iterations, kept in (
+            (0.3, 6, 2 * KEPT),
+            (0.15, 6, KEPT),
+            (0.08, 6, KEPT),
+            (0.05, 6, KEPT),
+        ):
             tried = [refine(self.body, scan, self.prior, at, (sigma,), iterations) for at in tried]
             tried = sorted(tried, key=lambda at: at.score)[:kept]
         best = tried[0]
         reseeded = [self.reseed_arms(scan, best)]
-        # The best of those that face another way has its arms tried too: it might be the true one with an arm lost.
+        # The best of those that face another way has its arms tried too: it might be the true one with an arm
+        # lost.
         others = [at for at in tried[1:] if heading_difference(at, best) > OTHER_HEADING]
         reseeded += [self.reseed_arms(scan, at) for at in others[:1]]
         return sorted(reseeded, key=lambda at: at.score)
@@ -114,7 +125,9 @@ class PoseFinder:
             at = best
         return at
 
-    def from_previous(self, scan: CoarseScan, previous: CoarsePose, previous_centroid: np.ndarray) -> CoarsePose:
+    def from_previous(
+        self, scan: CoarseScan, previous: CoarsePose, previous_centroid: np.ndarray
+    ) -> CoarsePose:
         """The previous frame's pose, moved by the shift of the centroid and refined."""
         shift = scan.points.mean(0) - previous_centroid
         start = CoarsePose(previous.pose, previous.translation + shift, previous.betas)
@@ -123,7 +136,8 @@ class PoseFinder:
     def from_keypoints(
         self, scan: CoarseScan, keypoints: Float[np.ndarray, "25 4"], betas: np.ndarray | None = None
     ) -> CoarsePose | None:
-        """The pose that reaches triangulated BODY_25 keypoints (x y z confidence; NaN where unseen) inside the hull.
+        """The pose that reaches triangulated BODY_25 keypoints (x y z confidence; NaN where unseen) inside
+        the hull.
 
         None when fewer than eight keypoints, or not both sides of the body, were seen.
         """
@@ -133,7 +147,8 @@ class PoseFinder:
         if seen.sum() < 8 or not seen[right].any() or not seen[left].any():
             return None
         targets = Targets(
-            np.where(seen[:, None], keypoints[:, :3], 0.0), np.where(seen, np.clip(keypoints[:, 3], 0.1, 1.0), 0.0)
+            np.where(seen[:, None], keypoints[:, :3], 0.0),
+            np.where(seen, np.clip(keypoints[:, 3], 0.1, 1.0), 0.0),
         )
         best: CoarsePose | None = None
         for k in range(4):
@@ -156,14 +171,16 @@ class PoseFinder:
 
 
 def arm_configurations() -> Float[np.ndarray, "2 s 4 3"]:
-    """Rotation vectors of collar, shoulder, elbow, wrist for the left and the right arm, over all that arms do.
+    """Rotation vectors of collar, shoulder, elbow, wrist for the left and the right arm, over all that arms
+    do.
 
-    Upper arms point in ten directions around the shoulder, with the elbow nearly straight; in five of them also bent. From
-    the T-pose, x to the body's left, y up, z to the front.
+    Upper arms point in ten directions around the shoulder, with the elbow nearly straight; in five of them
+    also bent. From the T-pose, x to the body's left, y up, z to the front.
     """
     directions = {
-        "down": (0.15, -1.0, 0.05), "side": (1.0, 0.0, 0.0), "front": (0.1, -0.1, 1.0), "up": (0.25, 1.0, 0.0),
-        "up front": (0.3, 0.7, 0.7), "up side": (0.7, 0.7, 0.0), "down front": (0.2, -0.7, 0.7),
+        "down": (0.15, -1.0, 0.05), "side": (1.0, 0.0, 0.0), "front": (0.1, -0.1, 1.0),
+        "up": (0.25, 1.0, 0.0), "up front": (0.3, 0.7, 0.7), "up side": (0.7, 0.7, 0.0),
+        "down front": (0.2, -0.7, 0.7),
         "down side": (0.7, -0.7, 0.1), "across": (-0.4, -0.2, 1.0), "down back": (0.3, -0.8, -0.5),
     }  # fmt: skip
     bent = ("down", "side", "front", "up side", "down front")

@@ -1,8 +1,8 @@
 """Gauss-Newton normal equations of point-to-surface residuals, accumulated on the mesh.
 
-Each residual touches the three corners of one triangle, so its contribution to J^T J lives on vertices and mesh edges:
-once summed, nothing depends on the number of scan points any more. The sparsity pattern belongs to the topology and
-is built once.
+Each residual touches the three corners of one triangle, so its contribution to J^T J lives on vertices and
+mesh edges: once summed, nothing depends on the number of scan points any more. The sparsity pattern belongs
+to the topology and is built once.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from scipy.sparse import coo_matrix, csr_matrix
 
 from fit.closest import ClosestPoints
 
-#: Share of the isotropic (point-to-point) part beside the point-to-plane part: keeps the tangential directions tame.
+#: Share of the isotropic (point-to-point) part beside the point-to-plane part: keeps the tangential
+#: directions tame.
 TANGENTIAL_SHARE = 0.05
 
 _PAIRS = [(p, q) for p in range(3) for q in range(p, 3)]
@@ -26,8 +27,8 @@ _AXES = [(r, c) for r in range(3) for c in range(r, 3)]
 class MeshPattern:
     """Sparsity of a (3V, 3V) matrix with 3x3 blocks on the vertices and edges of a mesh.
 
-    indptr, indices: CSR structure; slot (F 81): where entry (corner p, axis r; corner q, axis c) of a triangle's
-    9x9 block is stored; diagonal (9V): where the entries of the vertices' own blocks are.
+    indptr, indices: CSR structure; slot (F 81): where entry (corner p, axis r; corner q, axis c) of a
+    triangle's 9x9 block is stored; diagonal (9V): where the entries of the vertices' own blocks are.
     """
 
     n_vertices: int
@@ -77,8 +78,9 @@ def accumulate(
 ) -> tuple[csr_matrix, Float[np.ndarray, "v 3"]]:
     """Sum the residuals r_k = weight_k d_k over the points.
 
-    Returns H (3V, 3V), the sum of weight_k b_p b_q [(1 - a) n n^T + a I], and the descent right-hand side (V 3), the
-    sum of weight_k b_p d_k n_k: moving the vertices by the solution of H u = g brings the surface to the points.
+    Returns H (3V, 3V), the sum of weight_k b_p b_q [(1 - a) n n^T + a I], and the descent right-hand side (V
+    3), the sum of weight_k b_p d_k n_k: moving the vertices by the solution of H u = g brings the surface to
+    the points.
     """
     order = np.argsort(closest.triangle_idx, kind="stable")
     order = order[weight[order] > 0]

@@ -1,8 +1,9 @@
 """Gauss-Newton with Levenberg damping on template, pose, translation and shape together.
 
-Normal equations are accumulated in vertex space (normal_equations.py), so the number of scan points hardly matters. The
-joint step is solved inexactly by preconditioned conjugate gradients; the preconditioner is the scalar factor of
-coupling * L + diag(trace H_ii / 3) + tether for the template and the dense block for the parameters.
+Normal equations are accumulated in vertex space (normal_equations.py), so the number of scan points hardly
+matters. The joint step is solved inexactly by preconditioned conjugate gradients; the preconditioner is the
+scalar factor of coupling * L + diag(trace H_ii / 3) + tether for the template and the dense block for the
+parameters.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ LARGEST_ROTATION = 0.5
 
 @dataclass(frozen=True)
 class ScanPoints:
-    """What the objective sees of a scan: points (N 3) m, outward normals (N 3), weight (N), 0 ignores a point."""
+    """What the objective sees of a scan: points (N 3) m, outward normals (N 3), weight (N), 0 ignores a
+    point."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
@@ -86,7 +88,8 @@ class Fitter:
 
         setup_jax()
         region = region_of_vertices(model)
-        # The paper's w: hands and feet, where scans are noisy (and hulls hardly resolve fingers), hold on to the model.
+        # The paper's w: hands and feet, where scans are noisy (and hulls hardly resolve fingers), hold on to
+        # the model.
         weight = np.where(np.isin(region, ("hand", "foot", "head")), 3.0, 1.0)
         return Fitter(
             model=model,
@@ -109,7 +112,9 @@ class Fitter:
         """J(beta): joints of the zero pose."""
         return self.model.joint_regressor @ self.shaped(betas)
 
-    def posed(self, state: BodyState, joints: Float[np.ndarray, "j 3"] | None = None) -> Float[np.ndarray, "v 3"]:
+    def posed(
+        self, state: BodyState, joints: Float[np.ndarray, "j 3"] | None = None
+    ) -> Float[np.ndarray, "v 3"]:
         """W(T, J, pose) + translation. Joints come from the betas unless given."""
         from fit.body.skinning import skin
 
@@ -144,10 +149,10 @@ class Fitter:
 class Objective:
     """The single-frame objective E(T, M(beta, 0), pose; scan) for one scan and one set of weights.
 
-    target: what E_cpl pulls the template to: None couples to M(beta, 0) (paper 4.1), a fixed template (V 3) couples to
-    that (paper 4.3). fit_scale (V): factor on lambda_fit a vertex of the body. container: the closed surface the body must
-    stay inside of. joints: fixed joints (J 3), or None for J(beta). pose_mean, pose_precision: of the Gaussian pose prior
-    over all joints but the root.
+    target: what E_cpl pulls the template to: None couples to M(beta, 0) (paper 4.1), a fixed template (V 3)
+    couples to that (paper 4.3). fit_scale (V): factor on lambda_fit a vertex of the body. container: the
+    closed surface the body must stay inside of. joints: fixed joints (J 3), or None for J(beta). pose_mean,
+    pose_precision: of the Gaussian pose prior over all joints but the root.
     """
 
     fitter: Fitter
@@ -178,7 +183,8 @@ class Objective:
         w, d = self.weights, closest.distance
         scale = len(self.fitter.model.template) / max(len(d), 1) * self.scan.weight
         if w.gate:
-            # A point whose normal opposes the body's belongs to another part (inner thighs, arm beside trunk).
+            # A point whose normal opposes the body's belongs to another part (inner thighs, arm beside
+            # trunk).
             cosine = (self.scan.normals * closest.normals).sum(1)
             scale = scale * np.clip((cosine + 0.2) / 0.6, 0.0, 1.0)
         skin_energy, skin_weight = terms.skin(d, w.sigma_m)
@@ -208,7 +214,10 @@ class Objective:
         difference = self.difference(state)
         total = w.coupling * terms.coupling(difference, self.fitter.laplacian)[0]
         total += w.tether * terms.tether(difference)[0]
-        total += w.pose_prior * terms.gaussian_prior(state.pose[1:].ravel(), self.pose_mean, self.pose_precision)[0]
+        total += (
+            w.pose_prior
+            * terms.gaussian_prior(state.pose[1:].ravel(), self.pose_mean, self.pose_precision)[0]
+        )
         total += w.shape_prior * float(state.betas @ state.betas)
         return total
 
@@ -232,17 +241,18 @@ class Objective:
         vertices = self.fitter.posed(state, self.joints)
         closest = closest_points(vertices, self.fitter.model.faces, self.scan.points)
         held = self.container_terms(vertices)
-        return float(self.point_terms(closest)[0].sum()) + self.prior_energy(state) + (held[0] if held else 0.0)
+        return (
+            float(self.point_terms(closest)[0].sum()) + self.prior_energy(state) + (held[0] if held else 0.0)
+        )
 
-    # ---- steps ----------------------------------------------------------------------------------------------------
     def _active(self) -> Int[np.ndarray, "a"]:
         n_pose, n_betas = self.fitter.n_pose, self.fitter.model.shape_directions.shape[2]
         u = self.unknowns
-        return np.flatnonzero(np.r_[np.full(n_pose, u.pose), np.full(3, u.translation), np.full(n_betas, u.betas)])
+        return np.flatnonzero(
+            np.r_[np.full(n_pose, u.pose), np.full(3, u.translation), np.full(n_betas, u.betas)]
+        )
 
-    def _parameter_priors(
-        self, state: BodyState
-    ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p"]]:
+    def _parameter_priors(self, state: BodyState) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p"]]:
         """Hessian and right-hand side of the priors on (pose, translation, betas)."""
         w, n_pose = self.weights, self.fitter.n_pose
         size = n_pose + 3 + len(state.betas)
@@ -353,7 +363,10 @@ class Objective:
         else:
             template = state.template
         return BodyState(
-            template, state.pose + step[:n_pose].reshape(-1, 3), state.translation + step[n_pose : n_pose + 3], betas
+            template,
+            state.pose + step[:n_pose].reshape(-1, 3),
+            state.translation + step[n_pose : n_pose + 3],
+            betas,
         )
 
 

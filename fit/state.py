@@ -12,8 +12,8 @@ from jaxtyping import Float
 class BodyState:
     """One body in one frame.
 
-    template: T_Est, the free-form vertices in the zero pose, m; pose: axis-angle a joint, rad; translation: m;
-    betas: shape coefficients of M(beta, 0), standard deviations. All in the body's upright frame (y up).
+    template: T_Est, the free-form vertices in the zero pose, m; pose: axis-angle a joint, rad; translation:
+    m; betas: shape coefficients of M(beta, 0), standard deviations. All in the body's upright frame (y up).
     """
 
     template: Float[np.ndarray, "v 3"]

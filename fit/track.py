@@ -1,4 +1,5 @@
-"""Pose and shape tracking (paper section 4.3): the fusion shape as regulariser, a detailed template every frame."""
+"""Pose and shape tracking (paper section 4.3): the fusion shape as regulariser, a detailed template every
+frame."""
 
 from __future__ import annotations
 
@@ -16,7 +17,6 @@ from fit.settings import FitSettings
 from fit.solver import Fitter, Objective, Unknowns, minimise
 from fit.state import BodyState
 from hull.scan import Scan
-
 
 #: How far outside the hull a vertex is brought back from, how deep inside it goes, and in how many rounds.
 REACH_M, SKIN_DEPTH_M, HOLD_ROUNDS = 0.03, 0.0003, 6
@@ -44,7 +44,8 @@ def track_frame(
 ) -> BodyState:
     """Pose first with the fusion shape as it is, then the template, coupled to the fusion shape.
 
-    container: the closed visual hull of the frame, if there is one: it contains the person, so the body stays inside.
+    container: the closed visual hull of the frame, if there is one: it contains the person, so the body stays
+    inside.
     """
     state = BodyState(fusion.template, alignment.state.pose, alignment.state.translation, fusion.betas)
     points = as_scan_points(scan)
@@ -72,10 +73,12 @@ def track_frame(
 
 
 def held_inside(fitter: Fitter, fusion: FusionShape, state: BodyState, container: Container) -> BodyState:
-    """The same body with the vertices that still lie outside the hull moved just inside it, their neighbours along.
+    """The same body with the vertices that still lie outside the hull moved just inside it, their neighbours
+    along.
 
-    A visual hull contains the person by construction, so nothing true is lost. Vertices farther out than REACH_M belong to
-    something that the hull lacks (a part hidden from a camera by an error in its mask) and are left alone.
+    A visual hull contains the person by construction, so nothing true is lost. Vertices farther out than
+    REACH_M belong to something that the hull lacks (a part hidden from a camera by an error in its mask) and
+    are left alone.
     """
     faces = fitter.model.faces
     for round_idx in range(HOLD_ROUNDS):
@@ -106,13 +109,16 @@ def track_sequence(
     report: Callable[[TrackedFrame], None] = lambda frame: None,
     container_of: Callable[[int], Container | None] = lambda frame_id: None,
 ) -> list[TrackedFrame]:
-    """Track all aligned frames; each starts from its alignment's pose. A failed alignment stays failed, with its reason."""
+    """Track all aligned frames; each starts from its alignment's pose. A failed alignment stays failed, with
+    its reason."""
     done = []
     for alignment in alignments:
         if alignment.status == "failed":
             frame = TrackedFrame(alignment.frame_id, alignment.state, np.inf, "failed", alignment.message)
         else:
-            scan = scan_of[alignment.frame_id] if isinstance(scan_of, Mapping) else scan_of(alignment.frame_id)
+            scan = (
+                scan_of[alignment.frame_id] if isinstance(scan_of, Mapping) else scan_of(alignment.frame_id)
+            )
             try:
                 container = container_of(alignment.frame_id)
                 state = track_frame(fitter, finder, fusion, alignment, scan, settings, container)
@@ -120,7 +126,11 @@ def track_sequence(
                 frame = TrackedFrame(alignment.frame_id, state, distance, alignment.status, alignment.message)
             except (FloatingPointError, np.linalg.LinAlgError) as error:
                 frame = TrackedFrame(
-                    alignment.frame_id, alignment.state, np.inf, "failed", f"frame {alignment.frame_id:06d}: {error}"
+                    alignment.frame_id,
+                    alignment.state,
+                    np.inf,
+                    "failed",
+                    f"frame {alignment.frame_id:06d}: {error}",
                 )
         done.append(frame)
         report(frame)

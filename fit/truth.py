@@ -1,11 +1,12 @@
 """The true naked body of a synthetic recording, as evaluation needs it.
 
-One file a sequence, `<sequence>.npz`: vertices (T V 3) m in the recording's world, faces, region (a name a vertex), outer (on the
-outside of the body), and optionally frame_ids (T), else frame k is number k.
+One file a sequence, `<sequence>.npz`: vertices (T V 3) m in the recording's world, faces, region (a name a
+vertex), outer (on the outside of the body), and optionally frame_ids (T), else frame k is number k.
 """
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,7 +46,8 @@ class Truth:
 def load_truth(path: Path, sequence: str = "") -> Truth:
     """Read the truth of a sequence from its file, or from the folder that holds it.
 
-    A folder may hold `<sequence>.npz`, or a single .npz of any name; `truth/` inside it is looked into as well.
+    A folder may hold `<sequence>.npz`, or a single .npz of any name; `truth/` inside it is looked into as
+    well.
     """
     path = Path(path)
     if path.is_dir():
@@ -57,24 +59,28 @@ def load_truth(path: Path, sequence: str = "") -> Truth:
             if len(found) != 1:
                 names = ", ".join(f.name for f in found) or "no .npz file"
                 raise TruthError(
-                    f"{path}: no truth for sequence '{sequence}' (found {names}); name the file itself with --truth"
+                    f"{path}: no truth for sequence '{sequence}' (found {names}); "
+                    "name the file itself with --truth"
                 )
         path = found[0]
     if not path.is_file():
         raise TruthError(f"{path}: no such truth file or folder")
     try:
-        with np.load(path, allow_pickle=False) as data:
+        # numpy leaves a file that it opened itself open when the archive is damaged
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
             missing = [key for key in ("vertices", "faces") if key not in data]
             if missing:
                 raise TruthError(f"{path}: the truth file lacks {', '.join(missing)}")
             vertices, faces = np.asarray(data["vertices"], float), np.asarray(data["faces"], np.int64)
             n = vertices.shape[1] if vertices.ndim == 3 else -1
             if vertices.ndim != 3 or vertices.shape[2] != 3 or not np.isfinite(vertices).all():
-                raise TruthError(f"{path}: vertices must be finite (frames, vertices, 3), found {vertices.shape}")
+                raise TruthError(
+                    f"{path}: vertices must be finite (frames, vertices, 3), found {vertices.shape}"
+                )
             region = np.asarray(data["region"]).astype(str) if "region" in data else np.full(n, "torso")
             outer = np.asarray(data["outer"], bool) if "outer" in data else np.ones(n, dtype=bool)
             frame_ids = data["frame_ids"].tolist() if "frame_ids" in data else list(range(len(vertices)))
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         if isinstance(error, TruthError):
             raise
         raise TruthError(f"{path}: cannot be read as a truth file ({error})") from error

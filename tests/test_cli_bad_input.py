@@ -216,6 +216,10 @@ def test_truths_that_are_not_there(tiny: TinyRun, tmp_path: Path, capsys: Captur
         "the truth file lacks vertices"
         in call(capsys, "evaluate", run, "--truth", tmp_path / "thin.npz").complaint
     )
+    for damaged in (b"", b"no archive", (tmp_path / "thin.npz").read_bytes()[:-40]):
+        (tmp_path / "cut.npz").write_bytes(damaged)
+        said = call(capsys, "evaluate", run, "--truth", tmp_path / "cut.npz")
+        assert "cut.npz: cannot be read as a truth file" in said.complaint
     np.savez(
         tmp_path / "later.npz", vertices=np.zeros((1, 4, 3)), faces=np.array([[0, 1, 2]]), frame_ids=[900]
     )

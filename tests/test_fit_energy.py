@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from fit import energy as terms
-from fit.normal_equations import MeshPattern, accumulate, edge_laplacian
 from fit.closest import closest_points
+from fit.normal_equations import MeshPattern, accumulate, edge_laplacian
 
 
 def octahedron(subdivisions: int = 2) -> tuple[np.ndarray, np.ndarray]:
@@ -66,7 +66,9 @@ def test_coupling_ignores_translation_and_matches_the_edge_sum():
     difference = rng.normal(size=vertices.shape)
     shifted, _ = terms.coupling(difference + np.array([3.0, -2.0, 1.0]), laplacian)
     energy, half_gradient = terms.coupling(difference, laplacian)
-    edges = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1), axis=0)
+    edges = np.unique(
+        np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1), axis=0
+    )
     assert energy == pytest.approx(((difference[edges[:, 0]] - difference[edges[:, 1]]) ** 2).sum())
     assert shifted == pytest.approx(energy)
     h = 1e-6
