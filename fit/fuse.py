@@ -7,7 +7,7 @@ same objective in the zero pose, all points cloth, gives the person's shape.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -86,7 +86,8 @@ def fit_scale_from_spread(
     """
     pooled = np.sqrt(smoothed_over_mesh(spread**2, faces, settings.spread_rounds))
     scale = (settings.spread_m / np.maximum(pooled, 1e-6)) ** (trust * settings.spread_power)
-    return np.clip(scale, *settings.fit_scale_limits)
+    # In doubt the tightest alignment is no evidence: the outside term must lose its lead, or the body shrivels.
+    return np.clip(scale, *settings.fit_scale_limits) * settings.doubtful_fit ** ((1.0 - trust) ** 2)
 
 
 def fuse(fitter: Fitter, alignments: Sequence[Alignment], settings: FitSettings) -> FusionShape:
@@ -112,13 +113,15 @@ def fuse(fitter: Fitter, alignments: Sequence[Alignment], settings: FitSettings)
     )
     spread = offsets.std(axis=0)
     enough = len(good) >= 4
-    fit_scale = np.ones(len(spread))
+    fit_scale, trust = np.ones(len(spread)), 1.0
     if enough:
-        fit_scale = fit_scale_from_spread(spread, fitter.model.faces, trust_in_spread(good, settings), settings)
+        trust = trust_in_spread(good, settings)
+        fit_scale = fit_scale_from_spread(spread, fitter.model.faces, trust, settings)
     n_joints = len(fitter.model.parents)
     state = BodyState(fitter.shaped(betas), np.zeros((n_joints, 3)), np.zeros(3), betas)
     pose_size = 3 * (n_joints - 1)
-    for weights in settings.fuse:
+    for stage in settings.fuse:
+        weights = replace(stage, sigma_m=stage.sigma_m * (2.0 - trust))
         objective = Objective(
             fitter,
             scan,
