@@ -68,8 +68,8 @@ def smoothed_over_mesh(
 def trust_in_spread(alignments: Sequence[Alignment], settings: FitSettings) -> float:
     """How far the spread may be read as cloth, 0 to 1.
 
-    Hulls of few or badly calibrated cameras have phantom volume that comes and goes; the alignments then stay away from
-    their scans, and spread between them tells of the hulls, not of the clothes.
+    Hulls of few or badly calibrated cameras have phantom volume that comes and goes; the alignments then stay
+    away from their scans, and spread between them tells of the hulls, not of the clothes.
     """
     doubt = float(np.median([a.distance_m for a in alignments])) - settings.trusted_distance_m
     return 1.0 / (1.0 + (max(doubt, 0.0) / settings.doubt_m) ** 2)
@@ -80,13 +80,14 @@ def fit_scale_from_spread(
 ) -> Float[np.ndarray, "v"]:
     """Factor on lambda_fit a vertex, from how much the cloth there moves about.
 
-    One constant makes bare or tight regions too thin and loosely covered ones too fat. Loose cloth moves: the spread of the
-    unposed alignments along the normal, pooled over the neighbourhood, grows with the thickness of what is worn. The
-    exponent is lowered where the spread cannot be trusted (`trust_in_spread`).
+    One constant makes bare or tight regions too thin and loosely covered ones too fat. Loose cloth moves: the spread
+    of the unposed alignments along the normal, pooled over the neighbourhood, grows with the thickness of what is
+    worn. The exponent is lowered where the spread cannot be trusted (`trust_in_spread`).
     """
     pooled = np.sqrt(smoothed_over_mesh(spread**2, faces, settings.spread_rounds))
     scale = (settings.spread_m / np.maximum(pooled, 1e-6)) ** (trust * settings.spread_power)
-    # In doubt the tightest alignment is no evidence: the outside term must lose its lead, or the body shrivels.
+    # In doubt the tightest alignment is no evidence: the outside term must lose its lead, or the body
+    # shrivels.
     return np.clip(scale, *settings.fit_scale_limits) * settings.doubtful_fit ** ((1.0 - trust) ** 2)
 
 
