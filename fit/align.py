@@ -123,7 +123,6 @@ def _align_in_order(
     for frame_id, scan, keypoints in scans:
         if scan is None:
             continue
-        coarse = CoarseScan.of(scan.points, scan.normals)
         if frame_id in done_before:
             alignment = done_before[frame_id]
             done.append(alignment)
@@ -132,9 +131,12 @@ def _align_in_order(
             else:
                 state = alignment.state
                 previous = CoarsePose(state.pose, state.translation, state.betas, alignment.score)
-                best_score, centroid = min(best_score, alignment.score), coarse.points.mean(0)
+                best_score, centroid = min(best_score, alignment.score), scan.points.mean(0)
             continue
         try:
+            if not (np.isfinite(scan.points).all() and np.isfinite(scan.normals).all()):
+                raise FloatingPointError("the scan holds NaN or infinite coordinates")
+            coarse = CoarseScan.of(scan.points, scan.normals)
             starts = starting_poses(finder, coarse, keypoints, previous, centroid, best_score)
             state = align_frame(fitter, finder, as_scan_points(scan), starts, settings)
             posed = fitter.posed(state)
@@ -162,7 +164,7 @@ def _align_in_order(
             )
         best_score = min(best_score, score)
         previous = CoarsePose(state.pose, state.translation, state.betas, score)
-        centroid = coarse.points.mean(0)
+        centroid = scan.points.mean(0)
         done.append(alignment)
         report(alignment)
     return done

@@ -80,9 +80,10 @@ def fit_scale_from_spread(
 ) -> Float[np.ndarray, "v"]:
     """Factor on lambda_fit a vertex, from how much the cloth there moves about.
 
-    One constant makes bare or tight regions too thin and loosely covered ones too fat. Loose cloth moves: the spread
-    of the unposed alignments along the normal, pooled over the neighbourhood, grows with the thickness of what is
-    worn. The exponent is lowered where the spread cannot be trusted (`trust_in_spread`).
+    One constant makes bare or tight regions too thin and loosely covered ones too fat. Loose cloth
+    moves: the spread of the unposed alignments along the normal, pooled over the neighbourhood, grows
+    with the thickness of what is worn. The exponent is lowered where the spread cannot be trusted
+    (`trust_in_spread`).
     """
     pooled = np.sqrt(smoothed_over_mesh(spread**2, faces, settings.spread_rounds))
     scale = (settings.spread_m / np.maximum(pooled, 1e-6)) ** (trust * settings.spread_power)
