@@ -281,6 +281,7 @@ def _save_fusion(
         joints=fusion.joints,
         spread=fusion.spread,
         fit_scale=fusion.fit_scale,
+        trust=fusion.trust,
         faces=model.faces,
         body=model.name,
         body_hash=model.content_hash,
@@ -294,7 +295,12 @@ def load_fusion(folder: RunFolder) -> FusionShape:
     if found is None:
         raise UserError(f"{folder.fusion}: missing or damaged; run: bodyhull fit {folder.root}")
     return FusionShape(
-        found["template"], found["betas"], found["joints"], found["spread"], found["fit_scale"]
+        found["template"],
+        found["betas"],
+        found["joints"],
+        found["spread"],
+        found["fit_scale"],
+        float(found["trust"]),
     )
 
 

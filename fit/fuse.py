@@ -29,7 +29,7 @@ class FusionShape:
     """T_Fu: template (V 3) m in the zero pose, betas of the model coupled to it, joints (J 3) m.
 
     spread (V): deviation of the unposed alignments along the normal, m (the paper's figure 2 colours by it).
-    fit_scale (V): factor on lambda_fit that was derived from it.
+    fit_scale (V): factor on lambda_fit that was derived from it; trust: how far the hulls could be trusted, 0 to 1.
     """
 
     template: Float[np.ndarray, "v 3"]
@@ -37,6 +37,7 @@ class FusionShape:
     joints: Float[np.ndarray, "j 3"]
     spread: Float[np.ndarray, "v"]
     fit_scale: Float[np.ndarray, "v"]
+    trust: float = 1.0
 
 
 def lost_points(
@@ -123,7 +124,11 @@ def fuse(fitter: Fitter, alignments: Sequence[Alignment], settings: FitSettings)
     state = BodyState(fitter.shaped(betas), np.zeros((n_joints, 3)), np.zeros(3), betas)
     pose_size = 3 * (n_joints - 1)
     for stage in settings.fuse:
-        weights = replace(stage, sigma_m=stage.sigma_m * (2.0 - trust))
+        weights = replace(
+            stage,
+            sigma_m=stage.sigma_m * (2.0 - trust),
+            coupling=stage.coupling * settings.stiffness(trust),
+        )
         objective = Objective(
             fitter,
             scan,
@@ -134,4 +139,4 @@ def fuse(fitter: Fitter, alignments: Sequence[Alignment], settings: FitSettings)
             fit_scale=fit_scale,
         )
         state = minimise(objective, state, settings.max_iterations, settings.relative_drop).state
-    return FusionShape(state.template, state.betas, fitter.joints(state.betas), spread, fit_scale)
+    return FusionShape(state.template, state.betas, fitter.joints(state.betas), spread, fit_scale, trust)

@@ -4,7 +4,7 @@ frame."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +20,8 @@ from hull.scan import Scan
 
 #: How far outside the hull a vertex is brought back from, how deep inside it goes, and in how many rounds.
 REACH_M, SKIN_DEPTH_M, HOLD_ROUNDS = 0.03, 0.0003, 6
+#: Hulls trusted less than this do not bound the body.
+TRUSTED = 0.5
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,13 @@ def track_frame(
         (settings.track_pose, Unknowns(template=False, betas=False), None),
         (settings.track_template, Unknowns(pose=False, translation=False, betas=False), fusion.fit_scale),
     )
-    for weights, unknowns, fit_scale in stages:
+    for stage, unknowns, fit_scale in stages:
+        # A hull that cannot be trusted neither contains the person nor knows his detail.
+        weights = replace(
+            stage,
+            coupling=stage.coupling * settings.stiffness(fusion.trust),
+            inside=stage.inside * fusion.trust,
+        )
         objective = Objective(
             fitter,
             points,
@@ -67,7 +75,7 @@ def track_frame(
             container=container,
         )
         state = minimise(objective, state, settings.max_iterations, settings.relative_drop).state
-    if container is not None:
+    if container is not None and fusion.trust > TRUSTED:
         state = held_inside(fitter, fusion, state, container)
     return state
 
