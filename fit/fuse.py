@@ -29,7 +29,8 @@ class FusionShape:
     """T_Fu: template (V 3) m in the zero pose, betas of the model coupled to it, joints (J 3) m.
 
     spread (V): deviation of the unposed alignments along the normal, m (the paper's figure 2 colours by it).
-    fit_scale (V): factor on lambda_fit that was derived from it; trust: how far the hulls could be trusted, 0 to 1.
+    fit_scale (V): factor on lambda_fit that was derived from it; trust: how far the hulls could be
+    trusted, 0 to 1.
     """
 
     template: Float[np.ndarray, "v 3"]
