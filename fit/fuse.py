@@ -129,6 +129,7 @@ def fuse(fitter: Fitter, alignments: Sequence[Alignment], settings: FitSettings)
             stage,
             sigma_m=stage.sigma_m * (2.0 - trust),
             coupling=stage.coupling * settings.stiffness(trust),
+            shape_prior=stage.shape_prior * settings.stiffness(trust),
         )
         objective = Objective(
             fitter,

@@ -81,11 +81,12 @@ class FitSettings:
     doubt_m: float = 0.002
     #: Factor on lambda_fit (and twice the sigma) where the spread is not to be trusted at all.
     doubtful_fit: float = 100.0
-    #: Factor on lambda_cpl there: phantom volume must not become lumps of the body.
-    doubtful_coupling: float = 300.0
+    #: Factor on lambda_cpl and on the shape prior there: phantom volume must not become lumps of the body,
+    #: nor a hunch.
+    doubtful_coupling: float = 500.0
     max_iterations: int = 15
     relative_drop: float = 1e-2
 
     def stiffness(self, trust: float) -> float:
-        """Factor on lambda_cpl for hulls that are trusted this far."""
+        """Factor on lambda_cpl and the shape prior for hulls that are trusted this far."""
         return float(self.doubtful_coupling ** ((1.0 - trust) ** 2))
