@@ -26,7 +26,7 @@ from fit.state import BodyState
 
 PCG_ITERATIONS = 15
 PCG_TOLERANCE = 0.05
-#: A body 0.3 rad or 0.1 m away after one step has left the region where the linearisation means anything.
+#: Radians: a joint that turns farther in one step has left the region where the linearisation means anything.
 LARGEST_ROTATION = 0.5
 
 
