@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fit.body import half_mesh, tape
-from fit.body.anatomy import height_map, make_person
+from fit.body.anatomy import make_person
 from fit.body.anthropometry import (
     BMI_RANGE,
     CIVILIAN_BMI,
@@ -17,6 +17,7 @@ from fit.body.anthropometry import (
 )
 from fit.body.build import load_or_build
 from fit.body.correspondence import Carrier
+from fit.body.plan import height_map
 from fit.body.remesh import SEAM_TOLERANCE_M
 from fit.body.shape_space import vertex_normals
 from fit.body.skeleton import LEFT_JOINTS, MIRROR

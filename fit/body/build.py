@@ -42,9 +42,9 @@ N_PEOPLE_FOR_JOINTS = 120
 DECIMALS = 9  # of the stored arrays: a nanometre, so that a last bit of some BLAS does not change the hash
 LICENCE = "CC0-1.0"
 GENERATOR = (
-    "ansur2.json", "anatomy.py", "anthropometry.py", "build.py", "correctives.py", "correspondence.py",
-    "half_mesh.py", "implicit.py", "joint_regressor.py", "parts.py", "remesh.py",
-    "shape_space.py", "skeleton.py", "skin_weights.py", "stations.py",
+    "anatomy.py", "ansur2.json", "anthropometry.py", "build.py", "correctives.py", "correspondence.py",
+    "foot.py", "half_mesh.py", "hand.py", "head.py", "implicit.py", "joint_regressor.py", "parts.py",
+    "plan.py", "remesh.py", "shape_space.py", "skeleton.py", "skin_weights.py", "stations.py",
 )  # fmt: skip
 
 

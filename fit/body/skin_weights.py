@@ -3,11 +3,11 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from .anatomy import height_map
 from .anthropometry import Measurements
 from .correspondence import neighbour_mean
 from .half_mesh import smooth_step
 from .implicit import unit
+from .plan import height_map
 from .skeleton import JOINT, MIRROR
 
 MOST_BONES = 4  # a vertex may follow, as in SMPL
