@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import coo_matrix, csr_matrix
 
-from .implicit import ImplicitBody
+from .implicit import Cone, ImplicitBody, Loft
 from .remesh import SEAM_TOLERANCE_M
 
 OFF_SEAM_M = 6e-4
@@ -33,8 +33,8 @@ class Carrier:
     ) -> None:
         self.seam = half[:, 0] < SEAM_TOLERANCE_M
         self.n = len(half)
-        self.ids = [i for i, p in enumerate(source.primitives) if p.carries]
-        carriers = [p for p in source.primitives if p.carries and not hasattr(p, "centre")]
+        self.ids = [i for i, p in enumerate(source.primitives) if isinstance(p, Loft | Cone) and p.carries]
+        carriers = [p for p in source.primitives if isinstance(p, Loft | Cone) and p.carries]
         distance = np.stack([p.distance(half) for p in carriers])
         excess = distance - distance.min(0)
         weight = np.exp(-np.clip(excess / SOFTNESS_M, 0, 30)) * (excess < FARTHEST_M)
@@ -43,7 +43,10 @@ class Carrier:
         self.weight = [w[ix, None] for w, ix in zip(weight, self.index, strict=True)]
         self.code = [p.encode(half[ix]) for p, ix in zip(carriers, self.index, strict=True)]
         # Which vertices each primitive shapes is the same in every body: decided once, on the template.
-        self.reached = [np.flatnonzero(p.distance(half) < 0.03 + p.blend_m) for p in source.primitives]
+        self.reached = [
+            index[p.distance(half[index]) < 0.03 + p.blend_m]
+            for p, index in zip(source.primitives, source.reached(half), strict=True)
+        ]
         self.smooth = neighbour_mean(faces, self.n)
 
     def _keep_sides(self, p: Float[np.ndarray, "h 3"]) -> None:
@@ -53,7 +56,7 @@ class Carrier:
         """Half vertices on this body's skin, floor frame, metres."""
         decoded = np.zeros((self.n, 3))
         for i, index, code, weight in zip(self.ids, self.index, self.code, self.weight, strict=True):
-            decoded[index] += body.primitives[i].decode(code) * weight  # type: ignore[union-attr]
+            decoded[index] += body.primitives[i].decode(code) * weight  # type: ignore[attr-defined]
         self._keep_sides(decoded)
 
         on_skin = decoded.copy()

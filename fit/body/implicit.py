@@ -27,6 +27,7 @@ def unit(vector: VectorLike) -> Float[np.ndarray, "3"]:
 
 class Primitive(Protocol):
     carries: bool  # whether template vertices ride on it
+    displaces: bool  # whether its distance is added to what is there, instead of joined with it
     blend_m: float  # radius of the smooth union with what is there already
     low: Float[np.ndarray, "3"]
     high: Float[np.ndarray, "3"]
@@ -44,6 +45,7 @@ class Loft:
     """
 
     carries = True
+    displaces = False
 
     def __init__(
         self,
@@ -119,6 +121,7 @@ class Loft:
 
 class Ellipsoid:
     carries = False
+    displaces = False
 
     def __init__(
         self, centre: VectorLike, radii: VectorLike, blend_m: float, axes: np.ndarray | None = None
@@ -137,6 +140,8 @@ class Ellipsoid:
 
 class Cone:
     """A rounded cone from a (radius_a) to b (radius_b)."""
+
+    displaces = False
 
     def __init__(
         self,
@@ -195,10 +200,10 @@ class ImplicitBody:
     REACH_M = 0.05  # beyond its box and blend radius a primitive is not asked
 
     def __init__(self) -> None:
-        self.primitives: list[Loft | Ellipsoid | Cone] = []
+        self.primitives: list[Primitive] = []
         self.is_cut: list[bool] = []
 
-    def add(self, primitive: Loft | Ellipsoid | Cone) -> None:
+    def add(self, primitive: Primitive) -> None:
         self.primitives.append(primitive)
         self.is_cut.append(False)
 
@@ -210,9 +215,11 @@ class ImplicitBody:
     def join(
         so_far: Float[np.ndarray, "..."],
         distance: Float[np.ndarray, "..."],
-        primitive: Loft | Ellipsoid | Cone,
+        primitive: Primitive,
         is_cut: bool,
     ) -> Float[np.ndarray, "..."]:
+        if primitive.displaces:
+            return so_far + distance
         if is_cut:
             return -smooth_minimum(-so_far, distance, primitive.blend_m)
         return smooth_minimum(so_far, distance, primitive.blend_m)
