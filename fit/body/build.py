@@ -44,7 +44,8 @@ LICENCE = "CC0-1.0"
 GENERATOR = (
     "anatomy.py", "ansur2.json", "anthropometry.py", "build.py", "correctives.py", "correspondence.py",
     "foot.py", "half_mesh.py", "hand.py", "head.py", "implicit.py", "implicit_relief.py",
-    "joint_regressor.py", "parts.py", "plan.py", "remesh.py", "shape_space.py", "skeleton.py", "skin_weights.py", "stations.py",
+    "joint_regressor.py", "parts.py", "plan.py", "remesh.py", "shape_space.py", "skeleton.py",
+    "skin_weights.py", "stations.py",
 )  # fmt: skip
 
 
