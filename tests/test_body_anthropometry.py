@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fit.body import half_mesh, tape
+from fit.body import half_mesh
 from fit.body.anatomy import make_person
 from fit.body.anthropometry import (
     BMI_RANGE,
@@ -17,10 +17,10 @@ from fit.body.anthropometry import (
 )
 from fit.body.build import load_or_build
 from fit.body.correspondence import Carrier
-from fit.body.plan import height_map
 from fit.body.remesh import SEAM_TOLERANCE_M
 from fit.body.shape_space import vertex_normals
 from fit.body.skeleton import LEFT_JOINTS, MIRROR
+from fit.body.tape import Levels, Subject, volume_m3
 
 
 @pytest.mark.parametrize(("sex", "name", "girth_m"), [(1.0, "waist", 0.94058), (0.0, "waist", 0.86091)])
@@ -66,7 +66,7 @@ def test_a_given_bmi_is_met_and_weight_follows() -> None:
 @pytest.mark.parametrize("sex", [0.0, 1.0])
 @pytest.mark.parametrize("bmi", [17.0, 25.0, 36.0])
 def test_a_tape_around_the_mesh_reads_what_was_asked(sex: float, bmi: float) -> None:
-    load_or_build("neutral", show_progress=False)
+    parts = load_or_build("neutral", show_progress=False).parts
     from fit.body.build import _shared_half_mesh, cache_folder
 
     half, faces = _shared_half_mesh(cache_folder(), lambda *_: None)
@@ -75,10 +75,11 @@ def test_a_tape_around_the_mesh_reads_what_was_asked(sex: float, bmi: float) -> 
     body, joints = make_person(person)
     carried = Carrier(half, faces, source)(body)
     vertices, whole_faces, _ = half_mesh.mirror(carried, faces)
-    read = tape.girths(vertices, whole_faces, joints, height_map(person))
+    subject = Subject(vertices, whole_faces, joints, parts, Levels.of_person(person))
+    read = {name: line.length_m(vertices) for name, line in subject.girth_lines().items()}
     errors = {name: 100 * (read[name] / getattr(person, name) - 1) for name in GIRTHS}
     assert max(abs(e) for e in errors.values()) < 3.0, f"girths off by per cent: {errors}"
-    litres = 1000 * tape.volume_m3(vertices, whole_faces)
+    litres = 1000 * volume_m3(vertices, whole_faces)
     assert litres == pytest.approx(person.weight, rel=0.05)
     assert np.ptp(vertices[:, 1]) == pytest.approx(person.stature, rel=0.01)
     # Correspondence keeps the seam, the sides and the orientation.
@@ -94,31 +95,3 @@ def test_joints_are_mirror_images() -> None:
     _, joints = make_person(measure(0.3, rng.standard_normal(n_scores())))
     for j in LEFT_JOINTS:
         np.testing.assert_array_equal(joints[MIRROR[j]], joints[j] * [-1, 1, 1])
-
-
-def test_a_girth_that_misses_the_body_says_so() -> None:
-    vertices, faces = np.eye(3), np.array([[0, 1, 2]])
-    with pytest.raises(ValueError, match="the plane does not cut"):
-        tape.girth(
-            vertices,
-            faces,
-            np.array([0, 5.0, 0]),
-            np.array([0, 1.0, 0]),
-            lambda p: np.ones(len(p), dtype=bool),
-        )
-
-
-def test_tape_of_a_cylinder_and_volume_of_a_box() -> None:
-    turns = np.linspace(0, 2 * np.pi, 400, endpoint=False)
-    ring = np.stack([0.1 * np.cos(turns), np.zeros(400), 0.1 * np.sin(turns)], 1)
-    vertices = np.concatenate([ring - np.array([0, 1, 0]), ring + np.array([0, 1, 0])])
-    i = np.arange(400)
-    j = (i + 1) % 400
-    faces = np.concatenate([np.stack([i, i + 400, j], 1), np.stack([j, i + 400, j + 400], 1)])
-    read = tape.girth(
-        vertices, faces, np.zeros(3), np.array([0, 1.0, 0]), lambda p: np.ones(len(p), dtype=bool)
-    )
-    assert read == pytest.approx(2 * np.pi * 0.1, rel=1e-4)
-    corner = np.array([[0, 0, 0], [2.0, 0, 0], [0, 3.0, 0], [0, 0, 1.0]])
-    tetrahedron = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
-    assert tape.volume_m3(corner, tetrahedron) == pytest.approx(1.0)
