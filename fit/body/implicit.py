@@ -7,7 +7,7 @@ another.
 """
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -25,6 +25,7 @@ def unit(vector: VectorLike) -> Float[np.ndarray, "3"]:
     return v / np.linalg.norm(v)
 
 
+@runtime_checkable
 class Primitive(Protocol):
     carries: bool  # whether template vertices ride on it
     displaces: bool  # whether its distance is added to what is there, instead of joined with it
