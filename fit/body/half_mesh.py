@@ -4,7 +4,8 @@ Marching cubes on a grid graded in x, y and z, then remeshing to a size field th
 face.
 """
 
-from collections.abc import Callable, Iterable
+import itertools
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -14,11 +15,24 @@ from skimage.measure import marching_cubes
 
 from .anatomy import make_person
 from .anthropometry import measure
+from .head import Head, feature_lines, head_of
 from .implicit import ImplicitBody
-from .remesh import SEAM_TOLERANCE_M, Remesher
+from .plan import plan
+from .remesh import OFF_SEAM_M, SEAM_TOLERANCE_M, Remesher
 from .skeleton import JOINT
 
 N_VERTICES = 6890
+# Edge lengths by place; the body's is the price of the face's.
+TRUNK_EDGE_M, PALM_EDGE_M, FINGER_EDGE_M = 0.0252, 0.0090, 0.0078
+HEEL_EDGE_M, TOE_EDGE_M = 0.0145, 0.0090
+SKULL_EDGE_M, FACE_EDGE_M = 0.0175, 0.0095
+SNAP = 0.4  # of an edge length: vertices as near as this to a feature line lie on it
+FACE_DETAIL = (  # place (see `head`), reach in x, y, z, edge length there
+    ((0.0320, 0.500, 0.078), (0.020, 0.014, 0.020), 0.0042),  # eye
+    ((0.0000, 0.196, 0.098), (0.030, 0.013, 0.020), 0.0045),  # mouth
+    ((0.0000, 0.330, 0.105), (0.020, 0.012, 0.016), 0.0050),  # tip of the nose
+    ((0.0760, 0.445, -0.0130), (0.020, 0.034, 0.022), 0.0057),  # ear
+)
 
 
 def smooth_step(low: float, high: float, t: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
@@ -73,19 +87,28 @@ def weld(
 
 
 def wanted_edge(
-    stature: float, wrist_x: float
+    head: Head, joints: Float[np.ndarray, "24 3"]
 ) -> Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]:
-    """Edge length in metres by place: 23.5 mm on the body, 8-10 mm at hands, feet and face."""
-    trunk, hand, foot, skull, face = 0.0235, 0.0078, 0.0105, 0.0165, 0.0088
+    """Edge length in metres by place, as the constants above say."""
+    wrist_x = float(joints[JOINT["left_wrist"], 0])
+    toes_z = float(joints[JOINT["left_foot"], 2])
+    centres = np.stack([head.at(*place) for place, _, _ in FACE_DETAIL])
 
     def wanted(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         x, y, z = points.T
-        edge = trunk + (hand - trunk) * smooth_step(wrist_x - 0.09, wrist_x + 0.05, x)
-        edge = np.minimum(edge, trunk + (foot - trunk) * smooth_step(0.16, 0.03, y))
-        in_face = smooth_step(0.02, 0.07, z) * smooth_step(stature - 0.07, stature - 0.12, y)
-        head = skull + (face - skull) * in_face
-        in_head = smooth_step(stature - 0.33, stature - 0.25, y) * (x < 0.25)
-        return np.minimum(edge, trunk + (head - trunk) * in_head)
+        edge = TRUNK_EDGE_M + (PALM_EDGE_M - TRUNK_EDGE_M) * smooth_step(wrist_x - 0.09, wrist_x + 0.03, x)
+        edge += (FINGER_EDGE_M - PALM_EDGE_M) * smooth_step(wrist_x + 0.05, wrist_x + 0.09, x)
+        foot = HEEL_EDGE_M + (TOE_EDGE_M - HEEL_EDGE_M) * smooth_step(toes_z - 0.02, toes_z + 0.02, z)
+        edge = np.minimum(edge, TRUNK_EDGE_M + (foot - TRUNK_EDGE_M) * smooth_step(0.16, 0.03, y))
+        in_face = smooth_step(0.01, 0.06, z) * smooth_step(
+            head.chin + 0.85 * head.height, head.chin + 0.6 * head.height, y
+        )
+        on_head = SKULL_EDGE_M + (FACE_EDGE_M - SKULL_EDGE_M) * in_face
+        for centre, (_, reach_m, edge_m) in zip(centres, FACE_DETAIL, strict=True):
+            away = np.sqrt((((points - centre) / reach_m) ** 2).sum(1))
+            on_head = np.minimum(on_head, edge_m + (on_head - edge_m) * smooth_step(0.7, 2.0, away))
+        in_head = smooth_step(head.chin - 0.10, head.chin - 0.02, y) * (x < 0.25)
+        return np.minimum(edge, TRUNK_EDGE_M + (on_head - TRUNK_EDGE_M) * in_head)
 
     return wanted
 
@@ -108,6 +131,47 @@ def settle_count(mesh: Remesher, target: int) -> None:
     raise AssertionError(f"remeshing stopped at {mesh.n_mirrored()} vertices instead of {target}")
 
 
+def on_skin(body: ImplicitBody, line: Float[np.ndarray, "k 3"], n: int = 40) -> Float[np.ndarray, "n 3"]:
+    """A polyline near the skin, resampled and brought onto it along z."""
+    p = np.stack(
+        [np.interp(np.linspace(0, len(line) - 1, n), np.arange(len(line)), line[:, i]) for i in range(3)], 1
+    )
+    depth = np.linspace(-0.03, 0.03, 121)
+    column = p[:, None] + depth[None, :, None] * np.array([0, 0, 1.0])
+    value = body(column.reshape(-1, 3)).reshape(n, -1)
+    last_inside = value.shape[1] - 1 - (value[:, ::-1] < 0).argmax(1)
+    p[:, 2] += depth[last_inside]
+    return p
+
+
+def pull_to_lines(
+    points: Float[np.ndarray, "n 3"],
+    on_seam: np.ndarray,
+    size: Float[np.ndarray, "n"],
+    lines: Sequence[Float[np.ndarray, "k 3"]],
+) -> Float[np.ndarray, "n 3"]:
+    """Vertices within SNAP edge lengths of a line move onto it, so that edges run along lids and lips."""
+    p = points.copy()
+    near = np.flatnonzero(
+        (p > np.min([q.min(0) for q in lines], 0) - 0.005).all(1)
+        & (p < np.max([q.max(0) for q in lines], 0) + 0.005).all(1)
+    )
+    best, target = np.full(len(near), np.inf), p[near].copy()
+    for line in lines:
+        for a, b in itertools.pairwise(line):
+            h = np.clip((p[near] - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+            foot = a + h[:, None] * (b - a)
+            away = np.linalg.norm(p[near] - foot, axis=1)
+            closer = away < best
+            best[closer], target[closer] = away[closer], foot[closer]
+    pulled = best < SNAP * size[near]
+    pulled &= ~on_seam[near] | (target[:, 0] < 1e-4)
+    p[near[pulled]] = target[pulled]
+    p[on_seam, 0] = 0
+    p[~on_seam, 0] = np.maximum(p[~on_seam, 0], OFF_SEAM_M)
+    return p
+
+
 def make_half_mesh(
     progress: Callable[[], object] = lambda: None,
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
@@ -121,6 +185,7 @@ def make_half_mesh(
         joints[JOINT["left_shoulder"], 1],
         joints[JOINT["left_wrist"], 0],
     )
+    head = head_of(plan(person))
     axes = (
         graded_axis(
             [(0.0, 0.16, 0.008), (0.16, wrist_x - 0.02, 0.011), (wrist_x - 0.02, wrist_x + 0.24, 0.0032)]
@@ -142,11 +207,15 @@ def make_half_mesh(
     v, f = weld(np.round(v, 6), f)
     progress()
 
-    wanted = wanted_edge(stature, wrist_x)
+    wanted = wanted_edge(head, joints)
     size_factor = 1.03
-    mesh = Remesher(
-        v, f, lambda p: size_factor * wanted(p), lambda p, seam: body.project(p, on_seam=seam, steps=1)
-    )
+    lines = [on_skin(body, line) for line in feature_lines(head)]
+
+    def settle(points: np.ndarray, on_seam: np.ndarray) -> np.ndarray:
+        points = body.project(points, on_seam=on_seam, steps=1)
+        return pull_to_lines(points, on_seam, size_factor * wanted(points), lines)
+
+    mesh = Remesher(v, f, lambda p: size_factor * wanted(p), settle)
     for round_idx in range(N_ROUNDS - 2):
         if round_idx:
             mesh.split_pass(1.4)

@@ -43,7 +43,7 @@ class Opening:
     """An almond sunk into the skin, between two arcs through its corners in the x-y plane, metres.
 
     rise_m, drop_m: how far the upper and the lower arc leave the line between the corners.
-    edge_m: width of the rim.
+    edge_m: how far inwards the full depth is reached.
     """
 
     corners: VectorLike  # (2 3)
@@ -114,8 +114,23 @@ class Relief:
         return -raised
 
 
+def arcs_of(opening: Opening, n: int = 9) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """The upper and the lower arc of the outline, z along the straight line between the corners."""
+    a, b = np.asarray(opening.corners, dtype=np.float64)
+    span = b - a
+    half = 0.5 * float(np.linalg.norm(span[:2]))
+    across = np.array([-span[1], span[0], 0.0]) / (2 * half)
+    u = np.linspace(-1, 1, n)
+    arcs = []
+    for sign, rise in ((1.0, opening.rise_m), (-1.0, opening.drop_m)):
+        radius = (half * half + rise * rise) / (2 * rise)
+        height = np.sqrt(np.maximum(radius**2 - (half * u) ** 2, 0)) - (radius - rise)
+        arcs.append(a + np.outer(0.5 * (u + 1), span) + sign * np.outer(height, across))
+    return arcs[0], arcs[1]
+
+
 def _inside(opening: Opening, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """1 well inside the almond, 0 outside, smooth across its rim."""
+    """0 on the almond's outline and outside it, 1 from edge_m inwards."""
     a, b = np.asarray(opening.corners, dtype=np.float64)
     middle, half = 0.5 * (a + b), 0.5 * float(np.linalg.norm((b - a)[:2]))
     along = (b - a)[:2] / (2 * half)
@@ -126,5 +141,5 @@ def _inside(opening: Opening, points: Float[np.ndarray, "n 3"]) -> Float[np.ndar
     for sign, rise in ((1.0, opening.rise_m), (-1.0, opening.drop_m)):
         radius = (half * half + rise * rise) / (2 * rise)
         outside = np.maximum(outside, np.hypot(u, v - sign * (rise - radius)) - radius)
-    x = np.clip(0.5 - outside / opening.edge_m, 0, 1) * (np.abs(q[:, 2]) < 0.04)
+    x = np.clip(-outside / opening.edge_m, 0, 1) * (np.abs(q[:, 2]) < 0.04)
     return x * x * (3 - 2 * x)
