@@ -186,7 +186,7 @@ def test_a_file_with_smpl_s_keys_alone_gets_parts_and_landmarks(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"posedirs": np.zeros((6890, 3, 100))}, r"pose_directions has shape \(6890, 3, 100\), expected"),
+        ({"posedirs": np.zeros((6890, 3, 100))}, r"posedirs has shape \(6890, 3, 100\), expected"),
         ({"weights": np.zeros((6890, 20))}, r"weights has shape \(6890, 20\), expected \(6890, 24\)"),
         ({"J_regressor": np.zeros((24, 10))}, r"J_regressor has shape \(24, 10\), expected \(24, 6890\)"),
         ({"weights": np.zeros((6890, 24))}, r"skinning weights of vertex 0 sum to 0.0000, not 1"),
@@ -194,14 +194,14 @@ def test_a_file_with_smpl_s_keys_alone_gets_parts_and_landmarks(tmp_path: Path) 
         ({"f": np.zeros((0, 3))}, r"there are 6890 vertices and 0 faces"),
         (
             {"v_template": np.full((6890, 3), np.nan)},
-            r"template holds values that are not finite",
+            r"v_template holds values that are not finite",
         ),
         (
             {"v_template": np.zeros(6890)},
             r"v_template is an array of shape \(6890,\).*expected numbers with 2",
         ),
-        ({"kintree_table": np.zeros((2, 52))}, r"kintree_table has 52 joints; bodies with SMPL's 24 joints"),
-        ({"kintree_table": np.zeros((2, 24))}, r"kintree_table has 24 joints in another order"),
+        ({"kintree_table": np.zeros((2, 52))}, r"kintree_table has 52 joints in another order than SMPL-H's"),
+        ({"kintree_table": np.zeros((2, 24))}, r"kintree_table has 24 joints in another order than SMPL's"),
     ],
 )
 def test_a_wrong_array_is_named(tmp_path: Path, changes: dict[str, np.ndarray], message: str) -> None:
@@ -226,26 +226,13 @@ def test_unreadable_and_absent_files_are_named(tmp_path: Path) -> None:
         BodyModel.load(tmp_path / "cut.npz")
     with pytest.raises(BodyModelError, match=r"nowhere\.npz: no such body file\. Use free:neutral"):
         load_body(tmp_path / "nowhere.npz")
-    (tmp_path / "basic.pkl").write_bytes(b"")
-    with pytest.raises(BodyModelError, match=r"basic\.pkl: body files are read as \.npz, this is \.pkl"):
-        load_body(tmp_path / "basic.pkl")
+    (tmp_path / "basic.obj").write_bytes(b"")
+    with pytest.raises(
+        BodyModelError, match=r"basic\.obj: body files are read as \.npz or \.pkl, this is \.obj"
+    ):
+        load_body(tmp_path / "basic.obj")
     with pytest.raises(BodyModelError, match="there is no such free body"):
         load_body("free:child")
-
-
-def test_a_pickle_inside_is_not_opened(tmp_path: Path) -> None:
-    class Program:
-        def __reduce__(self) -> tuple[object, tuple[str]]:
-            return Path.touch, (tmp_path / "ran",)  # type: ignore[return-value]
-
-    arrays = small_body()
-    arrays["J_regressor"] = np.array(Program(), dtype=object)
-    np.savez(tmp_path / "trap.npz", **arrays)
-    with pytest.raises(
-        BodyModelError, match="J_regressor is stored as a pickled object, which is not opened"
-    ):
-        BodyModel.load(tmp_path / "trap.npz")
-    assert not (tmp_path / "ran").exists()
 
 
 def test_fewer_betas_can_be_kept() -> None:

@@ -195,11 +195,20 @@ def test_an_unknown_body(recording: Path, capsys: Capture) -> None:
         capsys, "fit", run, "--body", "free:elf"
     ).complaint.replace("There are", "there are")
     assert "no such body file" in call(capsys, "fit", run, "--body", "nobody.npz").complaint
-    (recording.parent / "smpl.pkl").write_bytes(b"pickle")
-    assert (
-        "body files are read as .npz"
-        in call(capsys, "fit", run, "--body", recording.parent / "smpl.pkl").complaint
-    )
+    trap = recording.parent / "smpl.pkl"
+    for content, complaint in (
+        (b"pickle", "smpl.pkl: this pickle "),
+        (
+            b"cos\nsystem\n(S'touch ran'\ntR.",
+            "smpl.pkl: this pickle names os.system, which no body file needs",
+        ),
+        (
+            b"}.",
+            "smpl.pkl: no v_template, f, shapedirs, posedirs, weights, J_regressor, kintree_table in this",
+        ),
+    ):
+        trap.write_bytes(content)
+        assert complaint in call(capsys, "fit", run, "--body", trap).complaint
 
 
 def test_truths_that_are_not_there(tiny: TinyRun, tmp_path: Path, capsys: Capture) -> None:

@@ -18,6 +18,7 @@ FUNCTIONS = {
     "hull.mesh_file.save_mesh": "path vertices faces normals",
     "hull.mesh_file.load_mesh": "path",
     "fit.body.load_body": "spec",
+    "fit.body.body_file.read_body_file": "path",
     "fit.frames.recording_from_body": "up",
     "fit.truth.load_truth": "path sequence",
     "render.video.write_video": "path frames fps",
@@ -39,7 +40,9 @@ FIELDS = {
     "hull.visual_hull.Hull": "vertices faces normals n_witnesses problems",
     "hull.scan.Scan": "points normals faces is_skin weight",
     "fit.body.BodyModel": "name licence template faces shape_directions pose_directions weights "
-    "joint_regressor parents parts landmarks",
+    "joint_regressor parents parts landmarks n_anthropometric kind gender notes",
+    "fit.body.body_file.BodyFile": "name licence kind gender template faces shape_directions "
+    "expression_directions pose_directions weights joint_regressor parents parts landmarks",
     "fit.state.BodyState": "template pose translation betas",
     "fit.align.Alignment": "frame_id state score distance_m status message",
     "fit.fuse.FusionShape": "template betas joints spread fit_scale",
@@ -55,7 +58,8 @@ METHODS = {
     "capture.rig.Rig": "names save load with_world_scaled pinholes",
     "capture.recording.Recording": "silhouettes picture fingerprint",
     "hull.scan.Scan": "from_hull",
-    "fit.body.BodyModel": "content_hash save load",
+    "fit.body.BodyModel": "content_hash save load of_file as_file shaped with_betas",
+    "fit.body.body_file.BodyFile": "save",
 }
 
 

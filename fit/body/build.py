@@ -159,6 +159,7 @@ def build(
         parts=parts,
         landmarks=body_25_regressor(template, parts, regressor),
         n_anthropometric=N_ANTHROPOMETRIC,
+        gender=sex_name,
     )
 
 

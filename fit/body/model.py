@@ -1,13 +1,11 @@
 """The body model: SMPL-structured arrays (Loper et al., SIGGRAPH Asia 2015), their file, and where to get
 one.
 
-`load_body("free:neutral")` gives the licence-free body of this package, `load_body("model.npz")` any file
-with SMPL's arrays under SMPL's key names. Plain numpy: nothing here starts JAX.
+`load_body("free:neutral")` gives the licence-free body of this package, `load_body("model.npz")` a file of
+SMPL, SMPL-H or SMPL-X (`body_file` reads it). Plain numpy: nothing here starts JAX.
 """
 
 import hashlib
-import os
-import zipfile
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,15 +13,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from .body_archive import BodyModelError
+from .body_file import BodyFile, read_body_file
+from .joint_trees import fold_pose_directions, fold_regressor, fold_weights
 from .parts import body_25_regressor, part_labels
-from .skeleton import N_JOINTS, PARENTS
+from .skeleton import JOINT, PARENTS
 
-SMPL_KEYS = ("v_template", "f", "shapedirs", "posedirs", "weights", "J_regressor", "kintree_table")
 FREE_SEXES = ("neutral", "female", "male")
-
-
-class BodyModelError(ValueError):
-    """A body that cannot be had: one or two lines for the user saying what was found and what to do."""
+LOWEST_M, TALLEST_M = 0.3, 3.0  # a newborn lies below half a metre; whatever is taller is not in metres
 
 
 @dataclass(frozen=True)
@@ -51,6 +48,12 @@ class BodyModel:
     n_anthropometric: int = field(default=-1)
     """The first so many shape components come from body measures; the rest are smooth bumps along the normal.
     -1: all of them."""
+    kind: str = "SMPL"
+    """What it was made from: SMPL, SMPL-H or SMPL-X. All have SMPL's 24 joints here."""
+    gender: str = "unknown"
+    """neutral, female, male or unknown: the betas belong to it."""
+    notes: tuple[str, ...] = ()
+    """A sentence on every thing that was found out or left out while reading."""
 
     def __post_init__(self) -> None:
         if self.n_anthropometric < 0:
@@ -136,96 +139,69 @@ class BodyModel:
         """Write an .npz under SMPL's key names, atomically (a temporary name in the same folder, then a
         rename).
         """
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        parents = np.where(self.parents < 0, 2**32 - 1, self.parents).astype(np.uint32)  # as SMPL's files do
-        # The process number keeps two writers apart; an ordinary open keeps the user's file permissions.
-        temporary = path.with_name(f".{path.name}.{os.getpid()}")
-        try:
-            with temporary.open("wb") as stream:
-                np.savez_compressed(
-                    stream,
-                    v_template=self.template,
-                    f=self.faces.astype(np.uint32),
-                    shapedirs=self.shape_directions,
-                    posedirs=self.pose_directions,
-                    weights=self.weights,
-                    J_regressor=self.joint_regressor,
-                    kintree_table=np.stack([parents, np.arange(len(parents), dtype=np.uint32)]),
-                    J=self.joint_regressor @ self.template,
-                    name=np.array(self.name),
-                    licence=np.array(self.licence),
-                    hash=np.array(self.content_hash),
-                    parts=self.parts,
-                    landmarks=self.landmarks,
-                    n_anthropometric=np.array(self.n_anthropometric),
-                )
-            temporary.replace(path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+        self.as_file().save(path, hash=np.array(self.content_hash))
+
+    def as_file(self) -> BodyFile:
+        """The same as a file's content: a body of 24 joints, whatever it was made from."""
+        return BodyFile(
+            name=self.name,
+            licence=self.licence,
+            kind="SMPL",
+            gender=self.gender,
+            template=self.template,
+            faces=self.faces,
+            shape_directions=self.shape_directions,
+            expression_directions=np.zeros((self.n_vertices, 3, 0)),
+            pose_directions=self.pose_directions,
+            weights=self.weights,
+            joint_regressor=self.joint_regressor,
+            parents=self.parents,
+            parts=self.parts,
+            landmarks=self.landmarks,
+            n_anthropometric=self.n_anthropometric,
+        )
 
     @staticmethod
     def load(path: str | Path) -> "BodyModel":
-        """Read an .npz with SMPL's keys (24 joints). Raises BodyModelError with the reason."""
-        path = Path(path)
-        arrays = _read_arrays(path)
-        missing = [key for key in SMPL_KEYS if key not in arrays]
-        if missing:
-            found = ", ".join(sorted(arrays)) or "nothing"
-            raise BodyModelError(
-                f"{path}: no {', '.join(missing)} in this body file (found: {found}). "
-                f"An SMPL-format .npz holds {', '.join(SMPL_KEYS)}."
-            )
-        dimensions = {"v_template": 2, "f": 2, "shapedirs": 3, "posedirs": 3, "weights": 2, "J_regressor": 2}
-        for key, n_axes in {**dimensions, "kintree_table": 2}.items():
-            if arrays[key].ndim != n_axes or not np.issubdtype(arrays[key].dtype, np.number):
-                raise BodyModelError(
-                    f"{path}: {key} is an array of shape {arrays[key].shape} and type {arrays[key].dtype}, "
-                    f"expected numbers with {n_axes} axes."
-                )
-        parents = arrays["kintree_table"][0].astype(np.int64)
-        parents[parents == 2**32 - 1] = -1  # SMPL stores the root's missing parent as the largest uint32
-        if len(parents) != N_JOINTS or tuple(parents) != PARENTS:
-            raise BodyModelError(
-                f"{path}: kintree_table has {len(parents)} joints"
-                f"{' in another order' if len(parents) == N_JOINTS else ''}; "
-                f"bodies with SMPL's {N_JOINTS} joints are read (not SMPL-H or SMPL-X)."
-            )
+        """Read a body of the SMPL family (.npz or .pkl). Raises BodyModelError with the reason."""
+        return BodyModel.of_file(read_body_file(path), str(path))
 
-        def numbers(key: str) -> np.ndarray:
-            array = np.ascontiguousarray(arrays[key], dtype=np.float64)
-            if not np.isfinite(array).all():
-                raise BodyModelError(f"{path}: {key} holds values that are not finite.")
-            return array
-
-        template, weights, regressor = numbers("v_template"), numbers("weights"), numbers("J_regressor")
-        for key, shape, wanted in (
-            ("weights", weights.shape, (len(template), N_JOINTS)),
-            ("J_regressor", regressor.shape, (N_JOINTS, len(template))),
-        ):
-            if shape != wanted:
-                raise BodyModelError(
-                    f"{path}: {key} has shape {shape}, expected {wanted} for {len(template)} vertices."
-                )
-        _check_weights(str(path), weights)
-        parts = arrays["parts"].astype(np.int64) if "parts" in arrays else part_labels(weights)
-        landmarks = (
-            numbers("landmarks") if "landmarks" in arrays else body_25_regressor(template, parts, regressor)
-        )
+    @staticmethod
+    def of_file(file: BodyFile, where: str = "") -> "BodyModel":
+        """The body with SMPL's 24 joints: of SMPL-H and SMPL-X with hands and face held at rest (exact, see
+        `joint_trees`). Raises BodyModelError, beginning with `where`, for what cannot be a body."""
+        where = where or f"body {file.name!r}"
+        template = file.template.astype(np.float64)
+        weights = file.weights.astype(np.float64)
+        regressor = fold_regressor(file.kind, file.joint_regressor.astype(np.float64))
+        _check_weights(where, weights)
+        _check_upright(where, template, regressor @ template)
+        weights = fold_weights(file.kind, weights)
+        parts = part_labels(weights) if file.parts is None else file.parts
+        try:
+            landmarks = (
+                body_25_regressor(template, parts, regressor)
+                if file.landmarks is None
+                else file.landmarks.astype(np.float64)
+            )
+        except ValueError as error:
+            raise BodyModelError(f"{where}: {error}") from error
         return BodyModel(
-            name=str(arrays["name"]) if "name" in arrays else path.stem,
-            licence=str(arrays["licence"]) if "licence" in arrays else "unknown (see the file's origin)",
+            name=file.name,
+            licence=file.licence,
             template=template,
-            faces=arrays["f"].astype(np.int64),
-            shape_directions=numbers("shapedirs"),
-            pose_directions=numbers("posedirs"),
+            faces=file.faces,
+            shape_directions=file.shape_directions.astype(np.float64),
+            pose_directions=fold_pose_directions(file.kind, file.pose_directions.astype(np.float64)),
             weights=weights,
             joint_regressor=regressor,
-            parents=parents,
+            parents=np.array(PARENTS),
             parts=parts,
             landmarks=landmarks,
-            n_anthropometric=int(arrays["n_anthropometric"]) if "n_anthropometric" in arrays else -1,
+            n_anthropometric=file.n_anthropometric,
+            kind=file.kind,
+            gender=file.gender,
+            notes=file.notes,
         )
 
 
@@ -236,42 +212,26 @@ def _check_weights(where: str, weights: Float[np.ndarray, "v j"]) -> None:
         raise BodyModelError(f"{where}: skinning weights of vertex {worst} sum to {total[worst]:.4f}, not 1.")
 
 
-def _read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an .npz, none of them a pickle (a pickle is a program)."""
-    if not path.exists():
+def _check_upright(where: str, template: Float[np.ndarray, "v 3"], joints: Float[np.ndarray, "24 3"]) -> None:
+    """Metres and axes: the commonest mistakes of files that were made by other programs."""
+    tall = float(np.ptp(template[:, 1]))
+    if not LOWEST_M < tall < TALLEST_M:
         raise BodyModelError(
-            f"{path}: no such body file. Use free:neutral, free:female, free:male, "
-            f"or the path of an SMPL-format .npz."
+            f"{where}: the template is {tall:.3g} high (y), expected {LOWEST_M} to {TALLEST_M} metres. "
+            f"Scale it to metres, y up."
         )
-    if path.suffix != ".npz":
+    head_up = joints[JOINT["head"], 1] - joints[JOINT["pelvis"], 1]
+    hips = joints[JOINT["left_hip"], 0] - joints[JOINT["right_hip"], 0]
+    if head_up < 0.1 * tall or hips < 0.02 * tall:
         raise BodyModelError(
-            f"{path}: body files are read as .npz, this is {path.suffix or 'without a suffix'}. "
-            f"Convert it to an .npz with the keys {', '.join(SMPL_KEYS)}."
+            f"{where}: the template does not stand with y up and its left towards +x "
+            f"(head {head_up:+.2f} m above the pelvis, left hip {hips:+.2f} m from the right). Turn it so."
         )
-    try:
-        # numpy leaves a file that it opened itself open when the archive is damaged
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            arrays = {}
-            for key in archive.files:
-                try:
-                    arrays[key] = archive[key]
-                except ValueError as error:
-                    if key in SMPL_KEYS:
-                        raise BodyModelError(
-                            f"{path}: {key} is stored as a pickled object, which is not opened. "
-                            f"Store it as a plain array (a sparse J_regressor: J_regressor.toarray())."
-                        ) from error
-            return arrays
-    except BodyModelError:
-        raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise BodyModelError(
-            f"{path}: not a readable .npz ({error}). Copy or download the file again."
-        ) from error
 
 
 def load_body(spec: str | Path, *, show_progress: bool = True) -> BodyModel:
-    """The body of this specification: 'free:neutral', 'free:female', 'free:male', or the path of an .npz.
+    """The body of this specification: 'free:neutral', 'free:female', 'free:male', or the path of an .npz or
+    .pkl of SMPL, SMPL-H or SMPL-X.
 
     A free body is built at its first use (under a minute, with a progress bar) and then read from the user's
     cache.
