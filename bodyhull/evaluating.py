@@ -16,7 +16,6 @@ from bodyhull.errors import UserError
 from bodyhull.fitting import load_fusion, load_track
 from bodyhull.folder import RunFolder, write_atomically
 from fit.body.model import load_body
-from fit.closest import vertex_areas
 from fit.evaluate import (
     ErrorSummary,
     Surface,
@@ -29,6 +28,7 @@ from fit.evaluate import (
 )
 from fit.solver import Fitter
 from fit.state import BodyState
+from fit.surface import vertex_areas
 from fit.truth import SCORED_REGIONS, load_truth
 from hull.mesh_file import load_mesh
 

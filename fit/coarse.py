@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from fit.body.model import BodyModel
-from fit.closest import vertex_areas, vertex_normals
+from fit.surface import vertex_areas, vertex_normals
 
 #: Metres that a full turn of the normal counts in the nearest-neighbour search.
 NORMAL_WEIGHT_M = 0.08

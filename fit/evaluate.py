@@ -15,8 +15,9 @@ from jaxtyping import Bool, Float, Int
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
-from fit.closest import closest_points, vertex_areas
+from fit.closest import closest_points
 from fit.coarse import CoarseBody, CoarsePose
+from fit.surface import vertex_areas
 
 FIT_ITERATIONS = 12
 #: Vertices that drive the re-posing of the truth: enough for 24 joints, a fraction of the time of all.

@@ -14,10 +14,10 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix
 
 from fit.align import Alignment
-from fit.closest import vertex_normals
 from fit.settings import FitSettings
 from fit.solver import Fitter, Objective, ScanPoints, Unknowns, minimise
 from fit.state import BodyState
+from fit.surface import vertex_normals
 
 #: Unposed vertices this many robust deviations inside the others are lost points, not a tighter fit.
 CLIP_MAD = 3.5

@@ -19,10 +19,11 @@ from scipy.sparse.linalg import splu
 
 from fit import energy as terms
 from fit.body.model import BodyModel
-from fit.closest import ClosestPoints, Container, closest_points, vertex_normals
+from fit.closest import ClosestPoints, Container, closest_points
 from fit.normal_equations import MeshPattern, accumulate, edge_laplacian
 from fit.settings import StageWeights
 from fit.state import BodyState
+from fit.surface import vertex_normals
 
 PCG_ITERATIONS = 15
 PCG_TOLERANCE = 0.05

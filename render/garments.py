@@ -25,8 +25,7 @@ import scipy.sparse as sp
 from jaxtyping import Float, Integer, UInt8
 
 from fit.body.skeleton import JOINT
-
-from .scene import vertex_normals
+from fit.surface import vertex_normals
 
 RIM_DEPTH_M = 0.004
 """How far under the skin a closed edge ends (m)."""

@@ -13,7 +13,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .scene import Light, Surface, vertex_normals
+from fit.surface import vertex_normals
+
+from .scene import Light, Surface
 
 SHADOW_START_M = 0.006
 """Shadow rays begin this far off the surface (m), beyond the next layer of thin cloth's grazing hits."""

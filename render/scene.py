@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Float32, Integer, UInt8
 
 from capture.camera import Camera
 from capture.layouts import look_at
+from fit.surface import vertex_normals
 
 from .gl import FIX, GlError, import_pyrender
 
@@ -312,19 +313,6 @@ class Renderer:
                 f"camera {camera.name} has pictures of {camera.size[0]} x {camera.size[1]}, "
                 f"the renderer draws {self.size[0]} x {self.size[1]}: make one renderer a size"
             )
-
-
-def vertex_normals(
-    vertices: Float[np.ndarray, "v 3"], faces: Integer[np.ndarray, "f 3"]
-) -> Float[np.ndarray, "v 3"]:
-    """Area-weighted unit normals; (0, 0, 1) for a vertex without area."""
-    corners = vertices[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.stack(
-        [np.bincount(faces.ravel(), np.repeat(normal[:, k], 3), minlength=len(vertices)) for k in range(3)], 1
-    )
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.where(length > 1e-30, total / np.maximum(length, 1e-30), [0.0, 0.0, 1.0])
 
 
 def _aim(light: Light) -> Float[np.ndarray, "4 4"]:

@@ -15,9 +15,10 @@ from jaxtyping import Float, Int, UInt8
 from fit.body import BodyModel
 from fit.body.parts import REGIONS, region_mask, region_of_vertices
 from fit.body.skeleton import JOINT, axis_angle_to_matrix, blend_linearly, world_from_rest
+from fit.surface import vertex_normals
 
 from .garments import Garment, Landmarks, cut_out, drape
-from .scene import Surface, vertex_normals
+from .scene import Surface
 from .wardrobe import OUTFITS, hair, shoes
 
 DETAIL_MEAN_M = 0.0025

@@ -18,9 +18,9 @@ from fit.body.anthropometry import (
 from fit.body.build import load_or_build
 from fit.body.correspondence import Carrier
 from fit.body.remesh import SEAM_TOLERANCE_M
-from fit.body.shape_space import vertex_normals
 from fit.body.skeleton import LEFT_JOINTS, MIRROR
 from fit.body.tape import Levels, Subject, volume_m3
+from fit.surface import vertex_normals
 
 
 @pytest.mark.parametrize(("sex", "name", "girth_m"), [(1.0, "waist", 0.94058), (0.0, "waist", 0.86091)])

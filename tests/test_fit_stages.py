@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from fit.align import Alignment, align_sequence, mean_distance
-from fit.closest import Container, vertex_normals
+from fit.closest import Container
 from fit.evaluate import Surface, pose_truth_to, signed_error_mm, summarise, transfer_rig
 from fit.frames import apply, recording_from_body, scan_in_body_frame
 from fit.fuse import fit_scale_from_spread, fuse, lost_points, trust_in_spread
 from fit.settings import FitSettings
 from fit.state import BodyState
+from fit.surface import vertex_normals
 from fit.track import held_inside, track_frame
 from hull.scan import Scan
 from tests.test_fit_pose_finding import finder, fitter

@@ -7,7 +7,8 @@ import pytest
 
 from capture.camera import Camera
 from capture.layouts import dome_layout
-from render.scene import Light, Renderer, Stage, Surface, clip_from_world, vertex_normals
+from fit.surface import vertex_normals
+from render.scene import Light, Renderer, Stage, Surface, clip_from_world
 
 SIZE = (192, 128)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bodyhull.evaluating import error_text, evaluate_stage
-from fit.closest import vertex_normals
+from fit.surface import vertex_normals
 from hull.mesh_file import load_mesh
 from tests.command_line import call
 from tests.tiny_run import FAILED, GOOD, TinyRun

@@ -7,8 +7,9 @@ import pytest
 from fit.body import BodyModel, load_body
 from fit.body.parts import region_mask
 from fit.body.skeleton import axis_angle_to_matrix
+from fit.surface import vertex_normals
 from render.garments import drape
-from render.scene import Surface, vertex_normals
+from render.scene import Surface
 from render.subject import BARE, CLOTH, HAIR, SHOE, SubjectError, make_subject
 from render.synthetic import UP, perform
 from render.wardrobe import OUTFITS

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 
 from .body_archive import BodyArchive, BodyModelError, open_archive
 from .joint_trees import KIND_OF_SIZE, TREES
+from .marks import KEYS as MARKS
 
 SPELLINGS: dict[str, tuple[str, ...]] = {
     "v_template": ("v_template", "vertices_template", "template", "mesh_template"),
@@ -30,7 +31,7 @@ SPELLINGS: dict[str, tuple[str, ...]] = {
 GENDERS = ("neutral", "female", "male")
 N_SHAPE_OF_WIDTH = {400: 300, 20: 10}  # SMPL-X keeps shape and expression in one array, in these two editions
 EXTRAS = ("hands_meanl", "hands_meanr", "hands_componentsl", "hands_componentsr", "lmk_faces_idx",
-          "lmk_bary_coords", "vt", "ft")  # fmt: skip
+          "lmk_bary_coords", "vt", "ft", *MARKS)  # fmt: skip
 """Plain arrays that are kept for other programs, where a file has them."""
 NO_LICENCE = "unknown (see the file's origin)"
 _ROOT_MARKS = (-1, 0, 2**32 - 1, 2**64 - 1)
@@ -296,6 +297,6 @@ def _extras(archive: BodyArchive) -> dict[str, np.ndarray]:
                 array = archive.array(name)
             except BodyModelError:
                 continue  # nothing of ours depends on it
-            if array.dtype.kind in "iuf":
+            if array.dtype.kind in "iufbU":
                 kept[name] = array
     return kept

@@ -16,27 +16,27 @@ from jaxtyping import Float, Int
 from platformdirs import user_cache_path
 from tqdm import tqdm
 
+from fit.surface import vertex_areas
+
 from . import half_mesh
 from .anatomy import make_person
 from .anthropometry import measure
 from .correctives import fit_pose_correctives
 from .correspondence import Carrier
 from .joint_regressor import fit_joint_regressor
+from .local_variation import local_components
 from .model import BodyModel, BodyModelError
 from .parts import body_25_regressor, part_labels, region_mask
+from .ramp import smooth_step
 from .remesh import SEAM_TOLERANCE_M
-from .shape_space import (
-    N_ANTHROPOMETRIC,
-    N_DISPLACEMENT,
-    displacement_components,
-    gather_people,
-    principal_components,
-    vertex_areas,
-)
+from .shape_space import N_ANTHROPOMETRIC, gather_people, principal_components
 from .skeleton import JOINT, PARENTS
 from .skin_weights import make_skin_weights
+from .smooth_variation import smooth_components
 
 SEX_COORDINATE: dict[str, float | None] = {"neutral": None, "female": 0.0, "male": 1.0}
+N_COMPONENTS = 160
+"""Of the shape space: people's principal components, then named local ones, then smooth ones."""
 N_PEOPLE = 500
 N_PEOPLE_FOR_JOINTS = 120
 DECIMALS = 9  # of the stored arrays: a nanometre, so that a last bit of some BLAS does not change the hash
@@ -44,8 +44,8 @@ LICENCE = "CC0-1.0"
 GENERATOR = (
     "anatomy.py", "ansur2.json", "anthropometry.py", "build.py", "correctives.py", "correspondence.py",
     "foot.py", "half_mesh.py", "hand.py", "head.py", "implicit.py", "implicit_relief.py",
-    "joint_regressor.py", "parts.py", "plan.py", "remesh.py", "shape_space.py", "skeleton.py",
-    "skin_weights.py", "stations.py",
+    "joint_regressor.py", "local_variation.py", "parts.py", "plan.py", "ramp.py", "remesh.py",
+    "shape_space.py", "skeleton.py", "skin_weights.py", "smooth_variation.py", "stations.py",
 )  # fmt: skip
 
 
@@ -142,7 +142,10 @@ def build(
     weights = make_skin_weights(template, faces, partner, joints, measure(0.5 if sex is None else sex))
     parts = part_labels(weights)
     held = _held(template, joints, parts)
-    bumps = displacement_components(template, faces, held, partner, N_DISPLACEMENT)
+    local = local_components(template, faces, joints, weights)
+    known = np.concatenate([anthropometric, local], 2)
+    n_smooth = N_COMPONENTS - known.shape[2]
+    smooth = smooth_components(template, faces, _smooth_amplitude(parts), held, partner, known, n_smooth)
     progress()
     correctives = fit_pose_correctives(template, weights, joints, partner)
     progress()
@@ -151,7 +154,7 @@ def build(
         licence=LICENCE,
         template=np.round(template, DECIMALS),
         faces=faces.astype(np.int64),
-        shape_directions=np.round(np.concatenate([anthropometric, bumps], 2), DECIMALS),
+        shape_directions=np.round(np.concatenate([known, smooth], 2), DECIMALS),
         pose_directions=np.round(correctives, DECIMALS),
         weights=weights,
         joint_regressor=regressor,
@@ -169,6 +172,18 @@ def _held(
     """Where the displacement components must vanish: hands, feet, and the head but for its neck side."""
     held = region_mask(parts, "hand", "foot").astype(np.float64)
     head = parts == JOINT["head"]
-    above = half_mesh.smooth_step(-0.02, 0.03, template[:, 1] - joints[JOINT["head"], 1])
-    jaw = half_mesh.smooth_step(0.02, 0.04, template[:, 2])
+    above = smooth_step(-0.02, 0.03, template[:, 1] - joints[JOINT["head"], 1])
+    jaw = smooth_step(0.02, 0.04, template[:, 2])
     return np.maximum(held, head * np.maximum(above, jaw))
+
+
+AMPLITUDE = {"torso": 1.1, "leg": 0.95, "arm": 1.0, "neck": 1.0}
+"""Standard deviation of smooth variation by region, relative; elsewhere OTHER_AMPLITUDE."""
+OTHER_AMPLITUDE = 0.6
+
+
+def _smooth_amplitude(parts: Int[np.ndarray, "v"]) -> Float[np.ndarray, "v"]:
+    amplitude = np.full(len(parts), OTHER_AMPLITUDE)
+    for region, value in AMPLITUDE.items():
+        amplitude[region_mask(parts, region)] = value
+    return amplitude

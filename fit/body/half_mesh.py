@@ -18,6 +18,7 @@ from .anthropometry import measure
 from .head import Head, feature_lines, head_of
 from .implicit import ImplicitBody
 from .plan import plan
+from .ramp import smooth_step
 from .remesh import OFF_SEAM_M, SEAM_TOLERANCE_M, Remesher
 from .skeleton import JOINT
 
@@ -33,12 +34,6 @@ FACE_DETAIL = (  # place (see `head`), reach in x, y, z, edge length there
     ((0.0000, 0.330, 0.105), (0.020, 0.012, 0.016), 0.0050),  # tip of the nose
     ((0.0760, 0.445, -0.0130), (0.020, 0.034, 0.022), 0.0057),  # ear
 )
-
-
-def smooth_step(low: float, high: float, t: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """0 below `low`, 1 above `high` (or the reverse when low > high), with flat ends."""
-    x = np.clip((t - low) / (high - low), 0, 1)
-    return x * x * (3 - 2 * x)
 
 
 def graded_axis(runs: Iterable[tuple[float, float, float]]) -> Float[np.ndarray, "n"]:

@@ -46,8 +46,8 @@ class BodyModel:
     landmarks: Float[np.ndarray, "25 v"]
     """OpenPose BODY_25 points as combinations of vertices (order: `parts.BODY_25`)."""
     n_anthropometric: int = field(default=-1)
-    """The first so many shape components come from body measures; the rest are smooth bumps along the normal.
-    -1: all of them."""
+    """The first so many shape components come from body measures; the others (`marks.shape_names`) are named
+    places and smooth bumps. -1: all of them."""
     kind: str = "SMPL"
     """What it was made from: SMPL, SMPL-H or SMPL-X. All have SMPL's 24 joints here."""
     gender: str = "unknown"
@@ -139,7 +139,9 @@ class BodyModel:
         """Write an .npz under SMPL's key names, atomically (a temporary name in the same folder, then a
         rename).
         """
-        self.as_file().save(path, hash=np.array(self.content_hash))
+        from .marks import marks_of  # marks are of a model: they import this module's neighbours
+
+        self.as_file().save(path, hash=np.array(self.content_hash), **marks_of(self))
 
     def as_file(self) -> BodyFile:
         """The same as a file's content: a body of 24 joints, whatever it was made from."""

@@ -5,9 +5,9 @@ from jaxtyping import Float, Int
 
 from .anthropometry import Measurements
 from .correspondence import neighbour_mean
-from .half_mesh import smooth_step
 from .implicit import unit
 from .plan import height_map
+from .ramp import smooth_step
 from .skeleton import JOINT, MIRROR
 
 MOST_BONES = 4  # a vertex may follow, as in SMPL
