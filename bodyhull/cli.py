@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 import bodyhull
+from bodyhull.body_commands import Body, perform_body
 from bodyhull.config import RunConfig
 from bodyhull.errors import ERROR, FRAMES_FAILED, OK, UserError
 from bodyhull.folder import RunFolder
@@ -121,6 +122,7 @@ Command = (
     | Annotated[Fit, tyro.conf.subcommand("fit")]
     | Annotated[Overlay, tyro.conf.subcommand("overlay")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Body, tyro.conf.subcommand("body")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
 )
@@ -213,6 +215,8 @@ def perform(command: object) -> int:
             return evaluate(command)
         case Synth():
             return synthesise(command)
+        case Body():
+            return perform_body(command)
         case Doctor():
             from bodyhull.doctor import findings, print_findings
 

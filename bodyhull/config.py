@@ -28,7 +28,8 @@ class RunConfig:
     sequence: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Which sequence, where the recording holds several."""
     body: str = "free:neutral"
-    """Body model: free:neutral, free:female, free:male, or the path of an .npz file in SMPL's format."""
+    """Body model: free:neutral, free:female, free:male, or the path of an .npz or .pkl of SMPL, SMPL-H or
+    SMPL-X."""
     calibration: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Calibration to use instead of the recording's own: a .qca.txt file, a rig.json, or a folder of
     camNN.txt."""

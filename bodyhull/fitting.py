@@ -90,8 +90,12 @@ def fit_stage(config: RunConfig, settings: FitSettings | None = None) -> None:
         settings_key=settings_key,
         body=config.body,
         body_hash=model.content_hash,
+        kind=model.kind,
+        gender=model.gender,
         settings=asdict(settings),
     )
+    for note in model.notes:
+        tqdm.write(f"body: {note}", file=sys.stderr)
     fitter, finder = Fitter.of(model), _finder(model)
     world_from_body = recording_from_body(np.asarray(recording["up"]))
     scans = {
@@ -333,6 +337,8 @@ def _save_track(
         faces=fitter.model.faces,
         body=fitter.model.name,
         body_hash=fitter.model.content_hash,
+        kind=fitter.model.kind,
+        gender=fitter.model.gender,
     )
 
 
