@@ -47,6 +47,8 @@ class Fit:
     """Folder of OpenPose BODY_25 files, <camera>/<frame>.json, to start the pose from."""
     overwrite: bool = False
     """Replace the fit that the folder holds."""
+    pose_prior: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Pose prior, if another than the run was made with: an .npz with mean (69) and covariance (69 x 69)."""
 
 
 @dataclass(frozen=True)
@@ -202,7 +204,9 @@ def perform(command: object) -> int:
         case Fit():
             from bodyhull.fitting import fit_stage
 
-            config = configuration_of(command.run, command.overwrite, command.body, command.keypoints)
+            config = configuration_of(
+                command.run, command.overwrite, command.body, command.keypoints, command.pose_prior
+            )
             fit_stage(config)
             return frames_code(command.run, "fit")
         case Overlay():
@@ -227,7 +231,11 @@ def perform(command: object) -> int:
 
 
 def configuration_of(
-    root: Path, overwrite: bool = False, body: str | None = None, keypoints: Path | None = None
+    root: Path,
+    overwrite: bool = False,
+    body: str | None = None,
+    keypoints: Path | None = None,
+    pose_prior: Path | None = None,
 ) -> RunConfig:
     """The configuration that a run folder was made with, with the changes asked for."""
     folder = RunFolder(root)
@@ -237,6 +245,8 @@ def configuration_of(
         config = dataclasses.replace(config, body=body)
     if keypoints is not None:
         config = dataclasses.replace(config, keypoints=keypoints)
+    if pose_prior is not None:
+        config = dataclasses.replace(config, pose_prior=pose_prior)
     return config
 
 

@@ -47,6 +47,8 @@ class RunConfig:
     """Folder of OpenPose BODY_25 files, <camera>/<frame>.json, to start the pose from. Never needed."""
     overwrite: bool = False
     """Redo what this run folder already holds."""
+    pose_prior: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Pose prior to use instead of the built-in one: an .npz with mean (69) and covariance (69 x 69), rad."""
 
     def carve_settings(self) -> dict[str, object]:
         """What the hulls depend on, besides the files' contents."""
@@ -56,7 +58,7 @@ class RunConfig:
     def fit_settings(self) -> dict[str, object]:
         """What the fit depends on, besides the hulls."""
         values = self.as_dict()
-        return {k: values[k] for k in ("body", "keypoints")}
+        return {k: values[k] for k in ("body", "keypoints", "pose_prior")}
 
     def as_dict(self) -> dict[str, object]:
         """JSON-ready values; paths made absolute so that the run folder can be used from anywhere."""
@@ -65,7 +67,7 @@ class RunConfig:
     @staticmethod
     def from_dict(values: dict[str, object]) -> RunConfig:
         """Inverse of as_dict."""
-        paths = {"recording", "out", "calibration", "background", "keypoints"}
+        paths = {"recording", "out", "calibration", "background", "keypoints", "pose_prior"}
         fields = set(RunConfig.__dataclass_fields__)
         if set(values) != fields:
             odd = sorted(fields.symmetric_difference(values))

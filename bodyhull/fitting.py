@@ -20,6 +20,7 @@ from bodyhull.errors import UserError
 from bodyhull.folder import RunFolder, load_arrays, save_arrays
 from fit.align import Alignment, align_sequence
 from fit.body.model import BodyModel, load_body
+from fit.body.pose_prior import PosePrior
 from fit.closest import Container
 from fit.frames import apply, recording_from_body, scan_in_body_frame
 from fit.fuse import FusionShape, fuse
@@ -64,10 +65,12 @@ def fit_stage(config: RunConfig, settings: FitSettings | None = None) -> None:
         raise UserError(f"{folder.root}: every frame's hull failed, so there is nothing to fit")
 
     model = load_body(config.body)
+    prior = _pose_prior(config.pose_prior)
     settings_key = digest(
         {
             "body": model.content_hash,
             "keypoints": keypoints_print(config.keypoints),
+            "pose_prior": prior.content_hash,
             "settings": asdict(settings),
         }
     )
@@ -96,7 +99,7 @@ def fit_stage(config: RunConfig, settings: FitSettings | None = None) -> None:
     )
     for note in model.notes:
         tqdm.write(f"body: {note}", file=sys.stderr)
-    fitter, finder = Fitter.of(model), _finder(model)
+    fitter, finder = Fitter.of(model), PoseFinder.of(model, prior)
     world_from_body = recording_from_body(np.asarray(recording["up"]))
     scans = {
         k: scan_in_body_frame(
@@ -169,10 +172,14 @@ def _container(path: Path, world_from_body: np.ndarray) -> Container:
     return Container.of(vertices @ world_from_body[:3, :3], faces)
 
 
-def _finder(model: BodyModel) -> PoseFinder:
-    from fit.body.pose_prior import PosePrior
-
-    return PoseFinder.of(model, PosePrior.standard())
+def _pose_prior(path: Path | None) -> PosePrior:
+    """The prior of this file, or the built-in one. Raises UserError where the file is no prior."""
+    if path is None:
+        return PosePrior.standard()
+    try:
+        return PosePrior.load(path)
+    except ValueError as error:
+        raise UserError(str(error)) from error
 
 
 def _finished(folder: RunFolder, frame_ids: list[int]) -> bool:

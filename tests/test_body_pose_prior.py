@@ -97,3 +97,24 @@ def test_a_file_can_replace_it_and_wrong_ones_are_named(prior: PosePrior, tmp_pa
     (tmp_path / "d.npz").write_text("no")
     with pytest.raises(ValueError, match="not a readable pose prior"):
         PosePrior.load(tmp_path / "d.npz")
+
+
+def test_natural_motions_are_within_reach(prior: PosePrior) -> None:
+    """No joint of a squat, a lunge, a walk or swinging arms lies more than 3.5 standard deviations out."""
+    from render.motions import make_motion
+
+    for name in ("squat", "lunge", "walk", "shoulders-mill", "tilt-twist"):
+        for seed in range(3):
+            off = make_motion(name, 24, seed).pose[:, 1:] - prior.mean.reshape(-1, 3)
+            for j in range(23):
+                own = slice(3 * j, 3 * j + 3)
+                inverse = np.linalg.inv(prior.covariance[own, own])
+                far = np.sqrt(np.einsum("ta,ab,tb->t", off[:, j], inverse, off[:, j])).max()
+                assert far < 3.6, f"{name}: {JOINT_NAMES[j + 1]} lies {far:.1f} standard deviations out"
+
+
+def test_its_hash_tells_priors_apart(prior: PosePrior, tmp_path: Path) -> None:
+    prior.save(tmp_path / "prior.npz")
+    assert PosePrior.load(tmp_path / "prior.npz").content_hash == prior.content_hash
+    wider = PosePrior(prior.mean, 1.1 * prior.covariance, prior.low, prior.high)
+    assert wider.content_hash != prior.content_hash

@@ -13,12 +13,12 @@ from tests.command_line import call
 Capture = pytest.CaptureFixture[str]
 RUN = (
     "RECORDING --out --sequence --body --calibration --frames --voxel-mm --units --up --background "
-    "--keypoints --overwrite"
+    "--keypoints --pose-prior --overwrite"
 )
 COMMANDS = {
     "run": RUN,
     "carve": RUN,
-    "fit": "RUN --body --keypoints --overwrite",
+    "fit": "RUN --body --keypoints --pose-prior --overwrite",
     "overlay": "RUN --overwrite",
     "evaluate": "RUN --truth",
     "synth": "OUT --cameras --size --layout --frames --motion --garment --seed --body --overwrite",
@@ -70,11 +70,12 @@ def test_options_arrive_in_the_configuration(taken: list[object], capsys: Captur
         capsys, "run", "rec", "--out", "there", "--sequence", "walk", "--body", "free:male",
         "--calibration", "c.json", "--frames", "0:100:5", "--voxel-mm", "5", "--units", "mm", "--up", "-y",
         "--background", "plates", "--keypoints", "openpose", "--overwrite",
+        "--pose-prior", "prior.npz",
     )  # fmt: skip
     assert taken == [
         cli.Run(
             Path("rec"), Path("there"), "walk", "free:male", Path("c.json"), "0:100:5", 5.0, "mm", "-y",
-            Path("plates"), Path("openpose"), True,
+            Path("plates"), Path("openpose"), True, Path("prior.npz"),
         )
     ]  # fmt: skip
 

@@ -50,7 +50,7 @@ FIELDS = {
     "fit.body.pose_prior.PosePrior": "mean covariance",
     "render.report.ReportData": "title subtitle headline problems facts tables sheet_headers sheet films",
     "bodyhull.config.RunConfig": "recording out sequence body calibration frames voxel_mm units up "
-    "background keypoints overwrite",
+    "background keypoints overwrite pose_prior",
 }
 METHODS = {
     "capture.camera.Camera": "project unproject rays pinhole undistort_image with_world_scaled "

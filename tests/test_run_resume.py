@@ -15,6 +15,7 @@ from bodyhull.config import RunConfig
 from bodyhull.errors import UserError
 from bodyhull.fitting import fit_stage, keypoints_print
 from bodyhull.folder import RunFolder, load_arrays
+from fit.body.pose_prior import PosePrior
 from hull.mesh_file import load_mesh
 from tests.command_line import call
 from tests.tiny_run import DEGRADED, SETTINGS, VOXEL_MM, TinyRun, silhouette, times
@@ -139,6 +140,25 @@ def test_other_settings_are_refused(tiny: TinyRun, tmp_path: Path, capsys: Captu
     assert remade(config.out, before) == set()
 
 
+def test_another_pose_prior_is_refused_and_a_wrong_one_named(
+    tiny: TinyRun, tmp_path: Path, capsys: Capture
+) -> None:
+    config = tiny.copy(tmp_path / "run")
+    standard = PosePrior.standard()
+    file = tmp_path / "prior.npz"
+    standard.save(file)
+    before = times(config.out)
+    fit_stage(replace(config, pose_prior=file), SETTINGS)  # the same numbers: nothing to do
+    assert remade(config.out, before) == set()
+    replace(standard, covariance=1.5 * standard.covariance).save(file)
+    with pytest.raises(UserError, match="holds a fit of body 'free:neutral' made with other settings"):
+        fit_stage(replace(config, pose_prior=file), SETTINGS)
+    file.write_text("no")
+    said = call(capsys, "fit", config.out, "--pose-prior", file)
+    assert "not a readable pose prior" in said.complaint
+    assert remade(config.out, before) == set()
+
+
 def test_a_refused_body_leaves_the_configuration_alone(tiny: TinyRun, tmp_path: Path) -> None:
     config = tiny.copy(tmp_path / "run")
     body = tmp_path / "other.npz"
@@ -234,7 +254,7 @@ def test_the_configuration_survives_its_file(tmp_path: Path) -> None:
     plain = RunConfig(tmp_path / "a", tmp_path / "b")
     full = RunConfig(
         tmp_path / "a", tmp_path / "b", "walk", "free:male", tmp_path / "c.json", "0:9:3", 5.0, "mm", "-y",
-        tmp_path / "plates", tmp_path / "keypoints", True,
+        tmp_path / "plates", tmp_path / "keypoints", True, tmp_path / "prior.npz",
     )  # fmt: skip
     for config in (plain, full):
         assert RunConfig.from_dict(json.loads(json.dumps(config.as_dict()))) == config

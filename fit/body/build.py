@@ -42,10 +42,11 @@ N_PEOPLE_FOR_JOINTS = 120
 DECIMALS = 9  # of the stored arrays: a nanometre, so that a last bit of some BLAS does not change the hash
 LICENCE = "CC0-1.0"
 GENERATOR = (
-    "anatomy.py", "ansur2.json", "anthropometry.py", "build.py", "correctives.py", "correspondence.py",
-    "foot.py", "half_mesh.py", "hand.py", "head.py", "implicit.py", "implicit_relief.py",
-    "joint_regressor.py", "local_variation.py", "parts.py", "plan.py", "ramp.py", "remesh.py",
-    "shape_space.py", "skeleton.py", "skin_weights.py", "smooth_variation.py", "stations.py",
+    "anatomy.py", "ansur2.json", "anthropometry.py", "bends.py", "build.py", "correctives.py",
+    "correspondence.py", "dual_quaternions.py", "flesh.py", "foot.py", "half_mesh.py", "hand.py", "head.py",
+    "implicit.py", "implicit_relief.py", "joint_regressor.py", "local_variation.py", "parts.py", "plan.py",
+    "pose_prior.py", "ramp.py", "remesh.py", "sections.py", "shape_space.py", "skeleton.py",
+    "skin_weights.py", "smooth_variation.py", "stations.py",
 )  # fmt: skip
 
 
@@ -147,7 +148,7 @@ def build(
     n_smooth = N_COMPONENTS - known.shape[2]
     smooth = smooth_components(template, faces, _smooth_amplitude(parts), held, partner, known, n_smooth)
     progress()
-    correctives = fit_pose_correctives(template, weights, joints, partner)
+    correctives = fit_pose_correctives(template, faces, weights, joints, partner)
     progress()
     return BodyModel(
         name=f"free:{sex_name}",

@@ -4,14 +4,15 @@ Ranges are round figures of the usual clinical tables (those of the American Aca
 and Boone & Azen 1979 are the common sources; hips, knees, ankles, elbows and wrists were compared with
 secondary tables, the originals were not consulted). How trunk and neck share theirs among the model's joints
 is ours, and so are means, standard deviations and couplings: a relaxed stance with hanging arms, narrow
-enough that a drawn pose is an everyday one. Deep hip and knee bends (squats, chairs) therefore lie three to
-five standard deviations out. Knees and elbows bend one way only: their means are bent, and samples are cut
-at the range.
+enough that a drawn pose is an everyday one. Deep hip and knee bends (squats, chairs) and arms overhead
+therefore lie about three standard deviations out. Knees and elbows bend one way only: their means are bent,
+and samples are cut at the range.
 
 Rotation vectors per joint in the T-pose's axes (x the body's left, y up, z front), radians. They are treated
 as three plain numbers: right for single-axis bends, good enough for a prior elsewhere.
 """
 
+import hashlib
 import os
 import zipfile
 from dataclasses import dataclass
@@ -33,21 +34,22 @@ RANGES_DEG: dict[str, tuple[_Row, _Row, _Row]] = {
     "left_hip": ((-120, 20, -14, 24), (-40, 45, 4, 11), (-25, 45, 4, 9)),
     # knee: x flexion 0 to 140; the other axes give a little
     "left_knee": ((0, 140, 25, 24), (-10, 10, 0, 3), (-6, 6, 0, 2)),
-    # ankle: x plantar flexion 45 / - dorsiflexion 20; y, z: rotation, inversion and eversion
-    "left_ankle": ((-20, 45, -2, 9), (-15, 15, 0, 5), (-15, 25, 0, 5)),
+    # ankle: x plantar flexion 45 / - dorsiflexion 20, but near 40 under the body's weight (squats, lunges);
+    # y, z: rotation, inversion and eversion
+    "left_ankle": ((-38, 45, -2, 12), (-15, 15, 0, 5), (-15, 25, 0, 6)),
     # toes: x - extension 60 / flexion 20
-    "left_foot": ((-60, 20, -4, 8), (-5, 5, 0, 2), (-5, 5, 0, 2)),
+    "left_foot": ((-60, 20, -4, 10), (-5, 5, 0, 2), (-5, 5, 0, 2)),
     # trunk: flexion 80, extension 25, side bend 35, rotation 45 in all
-    "spine1": ((-8, 30, 3, 6.5), (-14, 14, 0, 4.5), (-12, 12, 0, 4)),
-    "spine2": ((-8, 26, 2, 5.5), (-16, 16, 0, 5), (-12, 12, 0, 3.5)),
-    "spine3": ((-9, 24, 2, 4.5), (-15, 15, 0, 4.5), (-11, 11, 0, 3)),
+    "spine1": ((-8, 30, 3, 6.5), (-14, 14, 0, 5.5), (-12, 12, 0, 4)),
+    "spine2": ((-8, 26, 2, 5.5), (-16, 16, 0, 6), (-12, 12, 0, 3.5)),
+    "spine3": ((-9, 24, 2, 4.5), (-15, 15, 0, 5.5), (-11, 11, 0, 3)),
     # neck and head: flexion 50, extension 60, side bend 45, rotation 80 in all
     "neck": ((-30, 25, 2, 8), (-35, 35, 0, 9), (-22, 22, 0, 5)),
     "head": ((-30, 25, 0, 8), (-45, 45, 0, 10), (-22, 22, 0, 5)),
     # shoulder girdle: z elevation 30 / depression 10; y - protraction 15 / retraction 15
     "left_collar": ((-6, 6, 0, 2), (-15, 15, 0, 5), (-10, 30, -3, 6)),
-    # shoulder about the girdle: z - down 85 / up 65 from the T-pose; y - forward 135 / back 40; x twist
-    "left_shoulder": ((-70, 70, 4, 18), (-125, 40, -14, 24), (-85, 65, -60, 22)),
+    # shoulder about the girdle: z - down 90 / up 65 from the T-pose; y - forward 135 / back 40; x twist
+    "left_shoulder": ((-70, 70, 4, 18), (-125, 40, -14, 24), (-90, 65, -58, 29)),
     # elbow: y - flexion 0 to 145; x shares pronation and supination (80 each) with the wrist
     "left_elbow": ((-30, 30, 0, 9), (-145, 0, -34, 26), (-6, 6, 0, 2)),
     # wrist: x twist; y radial 20 / ulnar 30 deviation; z - flexion 70 / extension 70
@@ -121,6 +123,14 @@ class PosePrior:
     def whitening(self) -> Float[np.ndarray, "a a"]:
         """W such that |W (angles - mean)|2 is the squared Mahalanobis distance: a least-squares residual."""
         return np.linalg.inv(np.linalg.cholesky(self.covariance))
+
+    @cached_property
+    def content_hash(self) -> str:
+        """Short hash of mean and covariance: tells a run's prior apart from another."""
+        digest = hashlib.sha256()
+        for array in (self.mean, self.covariance):
+            digest.update(np.round(array, 9).astype("<f8").tobytes())
+        return digest.hexdigest()[:16]
 
     def sample(self, n: int, seed: int) -> Float[np.ndarray, "n a"]:
         """n poses; an angle beyond its range is set to the end of the range."""

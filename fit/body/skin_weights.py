@@ -65,7 +65,8 @@ def make_skin_weights(
 
     collar = smooth_step(0.015, 0.135, x) * smooth_step(level(0.742), level(0.805), y) * (y < level(0.87))
     # The side of the chest must not follow a raised arm: the arm's zone fades out below the armpit.
-    arm_zone = smooth_step(level(0.728), level(0.795), y)
+    past_armpit = smooth_step(0.0, 0.05, x - joint("left_shoulder")[0])
+    arm_zone = np.maximum(smooth_step(level(0.728), level(0.795), y), past_armpit)
     shoulder = smooth_step(-0.060, 0.055, x - joint("left_shoulder")[0] - 0.004) * arm_zone
     elbow = smooth_step(-0.040, 0.040, x - joint("left_elbow")[0])
     wrist = smooth_step(-0.022, 0.022, x - joint("left_wrist")[0])
@@ -74,7 +75,9 @@ def make_skin_weights(
     # The groin's plane runs from the crotch up to outside the hip joint; at the midline both legs pull half.
     below_groin = (p - joint("left_hip")) @ np.array([0.42, -0.907, 0.0])
     hip = smooth_step(-0.075, 0.065, below_groin)
-    hip *= np.where(below_groin < 0.05, 0.35 + 0.65 * smooth_step(0.0, 0.05, x), 1)
+    # Between the thighs the skin stays with the pelvis, down to the crotch and a little into the thighs.
+    crotch = y[(partner == np.arange(len(y))) & (np.abs(below_groin) < 0.15)].min()
+    hip *= 1 - 0.95 * smooth_step(-0.05, 0.0, y - crotch) * smooth_step(-0.06, 0.0, -x)
     hip *= (y < level(0.60)) & (x < 0.5)
     leg_down = unit(joint("left_ankle") - joint("left_hip"))
     knee = across("left_knee", leg_down, -0.050, 0.050)
@@ -86,7 +89,11 @@ def make_skin_weights(
     for side, here in (("left_", on_left), ("right_", 1 - on_left)):
         hand.on(("spine2", "spine3"), side + "collar", collar * here)
         hand.on(("neck",), side + "collar", 0.8 * collar * here)
-        hand.on(("spine1", "spine2", "spine3", side + "collar"), side + "shoulder", shoulder * here)
+        hand.on(
+            ("spine1", "spine2", "spine3", "neck", "head", side + "collar"),
+            side + "shoulder",
+            shoulder * here,
+        )
         hand.on((side + "shoulder",), side + "elbow", elbow * here)
         hand.on((side + "elbow",), side + "wrist", wrist * here)
         hand.on((side + "wrist",), side + "hand", fingers * here)

@@ -1,0 +1,288 @@
+"""How well the free body keeps its volume in bends, and how fast it is posed beside `body-models`.
+
+    python -m benchmarks.body_pose                    # both tables
+    python -m benchmarks.body_pose --volume           # volume kept, three sexes, mean and +-2 SD of weight
+    python -m benchmarks.body_pose --speed            # forward and Jacobian; theirs where it is installed
+
+Volume is counted of the whole body and of the segment around the joint alone (its part labels, closed by a
+fan over each open end), because the whole hides a pinch. Times are the least of the repetitions, one thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from fit.body import BodyModel, load_body
+from fit.body.sections import volume_m3
+from fit.body.skeleton import JOINT, N_JOINTS, axis_angle_to_matrix, blend_linearly, world_from_rest
+
+Turns = dict[str, tuple[float, float, float]]
+
+ARM = ("left_collar", "left_shoulder", "left_elbow")
+LOWER_ARM = ("left_elbow", "left_wrist")
+TRUNK = ("pelvis", "spine1", "spine2", "spine3", "left_collar", "right_collar")
+#: Name, turns in degrees (a bare joint name turns both sides), parts of the segment.
+BENDS: tuple[tuple[str, Turns, tuple[str, ...]], ...] = (
+    ("hip flexed 60", {"left_hip": (-60, 0, 0)}, ("pelvis", "left_hip")),
+    ("hip flexed 110", {"left_hip": (-110, 0, 0)}, ("pelvis", "left_hip")),
+    ("hip abducted 35", {"left_hip": (0, 0, 35)}, ("pelvis", "left_hip")),
+    ("hip extended 20", {"left_hip": (20, 0, 0)}, ("pelvis", "left_hip")),
+    ("knee 70", {"left_knee": (70, 0, 0)}, ("left_hip", "left_knee")),
+    ("knee 110", {"left_knee": (110, 0, 0)}, ("left_hip", "left_knee")),
+    ("knee 140", {"left_knee": (140, 0, 0)}, ("left_hip", "left_knee")),
+    ("ankle down 40", {"left_ankle": (40, 0, 0)}, ("left_knee", "left_ankle", "left_foot")),
+    ("ankle up 20", {"left_ankle": (-20, 0, 0)}, ("left_knee", "left_ankle", "left_foot")),
+    ("shoulder down", {"left_collar": (0, 0, -5), "left_shoulder": (0, 0, -75)}, (*TRUNK[2:], *ARM)),
+    ("shoulder overhead", {"left_collar": (0, 0, 26), "left_shoulder": (0, 0, 62)}, (*TRUNK[2:], *ARM)),
+    ("shoulder forward", {"left_collar": (0, -13, 0), "left_shoulder": (0, -85, 0)}, (*TRUNK[2:], *ARM)),
+    ("elbow 70", {"left_elbow": (0, -70, 0)}, ("left_shoulder", "left_elbow")),
+    ("elbow 110", {"left_elbow": (0, -110, 0)}, ("left_shoulder", "left_elbow")),
+    ("elbow 140", {"left_elbow": (0, -140, 0)}, ("left_shoulder", "left_elbow")),
+    ("forearm twist +80", {"left_elbow": (25, 0, 0), "left_wrist": (55, 0, 0)}, LOWER_ARM),
+    ("forearm twist -80", {"left_elbow": (-25, 0, 0), "left_wrist": (-55, 0, 0)}, LOWER_ARM),
+    ("wrist flexed 60", {"left_wrist": (0, 0, -60)}, ("left_elbow", "left_wrist")),
+    ("wrist extended 60", {"left_wrist": (0, 0, 60)}, ("left_elbow", "left_wrist")),
+    ("spine flexed 60", {f"spine{i}": (20, 0, 0) for i in (1, 2, 3)}, TRUNK),
+    ("spine bent 30", {f"spine{i}": (0, 0, 10) for i in (1, 2, 3)}, TRUNK),
+    ("spine turned 42", {f"spine{i}": (0, 14, 0) for i in (1, 2, 3)}, TRUNK),
+    ("neck flexed 45", {"neck": (22, 0, 0), "head": (23, 0, 0)}, ("spine3", "neck", "head")),
+    ("neck turned 70", {"neck": (0, 30, 0), "head": (0, 40, 0)}, ("spine3", "neck", "head")),
+    ("squat", {"hip": (-105, 12, 16), "knee": (120, 0, 0), "ankle": (-20, 0, 0), "spine1": (8, 0, 0),
+               "spine2": (8, 0, 0), "shoulder": (0, -65, -12)}, ()),
+    ("sit", {"hip": (-88, 0, 4), "knee": (90, 0, 0), "collar": (0, 0, -5), "shoulder": (0, 0, -70),
+             "elbow": (0, -80, 0)}, ()),
+    ("walk", {"left_hip": (-30, 0, 0), "right_hip": (18, 0, 0), "left_knee": (15, 0, 0),
+              "right_knee": (50, 0, 0), "left_shoulder": (25, 5, -65), "right_shoulder": (-20, 0, 65),
+              "elbow": (0, -30, 0)}, ()),
+    ("arms overhead", {"collar": (0, 0, 26), "shoulder": (0, 0, 62)}, ()),
+)  # fmt: skip
+
+
+def pose_of(turns: Turns) -> np.ndarray:
+    """Rotation vectors (24 3), rad."""
+    pose = np.zeros((N_JOINTS, 3))
+    for name, turn in turns.items():
+        if name in JOINT:
+            pose[JOINT[name]] = np.radians(turn)
+        else:
+            pose[JOINT[f"left_{name}"]] = np.radians(turn)
+            pose[JOINT[f"right_{name}"]] = np.radians(turn) * [1, -1, -1]
+    return pose
+
+
+def posed(model: BodyModel, template: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Skinned vertices (V 3) of this template, correctives and all, in plain numpy."""
+    rotations = axis_angle_to_matrix(pose)
+    corrected = template + model.pose_directions @ (rotations[1:] - np.eye(3)).ravel()
+    bones = world_from_rest(rotations, model.joint_regressor @ template)
+    return blend_linearly(corrected, model.weights, bones)[0]
+
+
+def closed_part(model: BodyModel, parts: tuple[str, ...]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Faces of these parts, and every boundary loop's directed edges (n 2); all faces where none is named."""
+    if not parts:
+        return model.faces, []
+    inside = np.isin(model.parts, [JOINT[p] for p in parts])
+    faces = model.faces[inside[model.faces].all(1)]
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    known = {(int(a), int(b)) for a, b in edges}
+    rim = [(a, b) for a, b in known if (b, a) not in known]
+    loops = _loops(rim)
+    return faces, loops
+
+
+def _loops(rim: list[tuple[int, int]]) -> list[np.ndarray]:
+    """Rim edges grouped by what they are connected to."""
+    root: dict[int, int] = {}
+
+    def find(a: int) -> int:
+        while root.setdefault(a, a) != a:
+            a = root[a]
+        return a
+
+    for a, b in rim:
+        root[find(a)] = find(b)
+    groups: dict[int, list[tuple[int, int]]] = {}
+    for a, b in rim:
+        groups.setdefault(find(a), []).append((a, b))
+    return [np.array(g) for g in groups.values()]
+
+
+def volume_of(vertices: np.ndarray, faces: np.ndarray, loops: list[np.ndarray]) -> float:
+    """Volume (m3) of faces closed by a fan over each loop."""
+    total = volume_m3(vertices, faces)
+    for loop in loops:
+        middle = vertices[loop[:, 0]].mean(0)
+        total += float(np.einsum("a,na->", middle, np.cross(vertices[loop[:, 1]], vertices[loop[:, 0]])) / 6)
+    return total
+
+
+def weight_component(model: BodyModel) -> int:
+    """The shape component that changes volume most at a given stature: the one a person would call weight."""
+    change = []
+    for k in range(min(model.n_anthropometric, 10)):
+        betas = np.zeros(model.n_betas)
+        ratio = []
+        for betas[k] in (-2, 2):
+            v = model.shaped(betas)
+            ratio.append(volume_m3(v, model.faces) / np.ptp(v[:, 1]) ** 3)
+        change.append(abs(np.log(ratio[1] / ratio[0])))
+    return int(np.argmax(change))
+
+
+def kept_volume(model: BodyModel, betas: np.ndarray) -> list[tuple[str, float, float]]:
+    """Per bend: change of the whole volume and of the segment's, per cent."""
+    template = model.shaped(betas)
+    rows = []
+    for name, turns, parts in BENDS:
+        bent = posed(model, template, pose_of(turns))
+        changes = []
+        for chosen in ((), parts):
+            faces, loops = closed_part(model, chosen)
+            before, after = (volume_of(v, faces, loops) for v in (template, bent))
+            changes.append(100 * (after / before - 1))
+        rows.append((name, changes[0], changes[1]))
+    return rows
+
+
+def print_volume_table() -> None:
+    columns = []
+    for sex in ("neutral", "female", "male"):
+        model = load_body(f"free:{sex}", show_progress=False)
+        heavy = weight_component(model)
+        for step in (0, 2, -2):
+            betas = np.zeros(model.n_betas)
+            betas[heavy] = step
+            columns.append((f"{sex} {step:+d}" if step else sex, kept_volume(model, betas)))
+    print("Change of volume, %: whole body / segment around the joint\n")
+    print("| bend | " + " | ".join(name for name, _ in columns) + " |")
+    print("|---" * (len(columns) + 1) + "|")
+    for i, (bend, *_) in enumerate(BENDS):
+        print(
+            f"| {bend} | "
+            + " | ".join(f"{rows[i][1]:+.1f} / {rows[i][2]:+.1f}" for _, rows in columns)
+            + " |"
+        )
+    worst = [max(columns, key=lambda c: max(abs(r[k]) for r in c[1])) for k in (1, 2)]
+    for k, what in ((1, "whole"), (2, "segment")):
+        row = max(worst[k - 1][1], key=lambda r: abs(r[k]))
+        print(f"\nLargest change of the {what}: {row[k]:+.2f} % ({worst[k - 1][0]}, {row[0]})")
+
+
+def least_ms(call: Callable[[], object], repetitions: int) -> float:
+    """Least wall time of a call in milliseconds, after one that compiles."""
+    import jax
+
+    jax.block_until_ready(call())
+    times = []
+    for _ in range(repetitions):
+        begin = time.perf_counter()
+        jax.block_until_ready(call())
+        times.append(time.perf_counter() - begin)
+    return 1e3 * min(times)
+
+
+def print_speed_table(repetitions: int) -> None:
+    """Ours and theirs on the free body written to SMPL's keys, in one process and double precision."""
+    from fit.body.skinning import SkinningArrays, joints_from_betas, shape_template, skin, skin_with_jacobian
+
+    model = load_body("free:neutral", show_progress=False)
+    arrays = SkinningArrays.of(model)
+    import jax
+    import jax.numpy as jnp
+
+    rng = np.random.default_rng(0)
+    pose = jnp.asarray(rng.normal(0, 0.3, (model.n_joints, 3)))
+    betas = jnp.asarray(rng.normal(0, 0.5, model.n_betas))
+    translation = jnp.asarray([0.1, 0.2, 0.3])
+
+    @jax.jit
+    def forward(pose: jax.Array, translation: jax.Array, betas: jax.Array) -> jax.Array:
+        template, joints = shape_template(arrays, betas), joints_from_betas(arrays, betas)
+        return skin(arrays, template, joints, pose, translation)
+
+    @jax.jit
+    def jacobian(pose: jax.Array, translation: jax.Array, betas: jax.Array) -> jax.Array:
+        template, joints = shape_template(arrays, betas), joints_from_betas(arrays, betas)
+        _, turn, columns = skin_with_jacobian(arrays, template, joints, pose, translation)
+        return columns.at[:, :, -len(betas) :].add(turn @ arrays.shape_directions)
+
+    def ours(call: Callable[..., object]) -> float:
+        return least_ms(lambda: call(pose, translation, betas), repetitions)
+
+    rows = [("forward", ours(forward)), ("Jacobian", ours(jacobian))]
+    vertices = np.asarray(forward(pose, translation, betas))
+    theirs = _their_times(model, pose, translation, betas, repetitions, vertices)
+    print(
+        f"\n{model.n_vertices} vertices, {model.n_joints} joints, {model.n_betas} betas, "
+        f"least of {repetitions} calls"
+    )
+    print("\n| double precision, jit | bodyhull ms | body-models ms | ratio |\n|---|---|---|---|")
+    for (name, ms), their_ms in zip(rows, theirs or (None, None), strict=True):
+        other = "not installed | -" if their_ms is None else f"{their_ms:.2f} | {ms / their_ms:.2f}"
+        print(f"| {name} | {ms:.2f} | {other} |")
+
+
+def _their_times(
+    model: BodyModel,
+    pose: np.ndarray,
+    translation: np.ndarray,
+    betas: np.ndarray,
+    repetitions: int,
+    expected: np.ndarray,
+) -> tuple[float, float] | None:
+    """Forward and Jacobian (jacfwd, same parameters) of body-models; None where it is not installed."""
+    try:
+        from body_models.smpl.jax import SMPL
+    except ImportError:
+        return None
+    import jax
+    import jax.numpy as jnp
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "free.npz"
+        model.save(path)
+        theirs = SMPL(model_path=path)
+    # It loads single precision; the same numbers in double, so that both do the same work.
+    theirs._assets = jax.tree_util.tree_map(
+        lambda a: a.astype(jnp.float64) if getattr(a, "dtype", None) == jnp.float32 else a, theirs._assets
+    )
+
+    def forward(pose: jax.Array, translation: jax.Array, betas: jax.Array) -> jax.Array:
+        return theirs.forward_vertices(
+            pose[1:], pelvis_rotation=pose[0], shape=betas, global_translation=translation
+        )
+
+    jitted = jax.jit(forward)
+    jacobian = jax.jit(jax.jacfwd(forward, argnums=(0, 1, 2)))
+    found = jitted(pose, translation, betas)
+    assert found.dtype == np.float64, f"their vertices came as {found.dtype}"
+    assert np.abs(np.asarray(found) - expected).max() < 1e-5, "both pose the same body"
+    return (
+        least_ms(lambda: jitted(pose, translation, betas), repetitions),
+        least_ms(lambda: jacobian(pose, translation, betas), repetitions),
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--volume", action="store_true", help="only the volume table")
+    parser.add_argument("--speed", action="store_true", help="only the speed table")
+    parser.add_argument("--repetitions", type=int, default=40)
+    options = parser.parse_args()
+    if not options.speed:
+        print_volume_table()
+    if not options.volume:
+        print_speed_table(options.repetitions)
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    main()
