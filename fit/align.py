@@ -69,7 +69,7 @@ def align_frame(
                 fitter,
                 scan,
                 weights,
-                Unknowns(template=False),
+                Unknowns(template=False, n_betas=settings.pose_betas),
                 finder.prior.mean,
                 finder.prior.precision,
                 joints=joints,

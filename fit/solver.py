@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.sparse import csr_matrix, diags
 from scipy.sparse.linalg import splu
 
@@ -22,6 +22,7 @@ from fit.body.model import BodyModel
 from fit.closest import ClosestPoints, Container, closest_points
 from fit.normal_equations import MeshPattern, accumulate, edge_laplacian
 from fit.settings import StageWeights
+from fit.shape_operators import ShapeOperators
 from fit.state import BodyState
 from fit.surface import vertex_normals
 
@@ -44,12 +45,13 @@ class ScanPoints:
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Which unknowns a stage may change."""
+    """Which unknowns a stage may change; n_betas: only the first so many coefficients (None: all)."""
 
     template: bool = True
     pose: bool = True
     translation: bool = True
     betas: bool = True
+    n_betas: int | None = None
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ class _Linearised:
     hessian: csr_matrix  # data term, posed vertices (3V, 3V)
     rhs: Float[np.ndarray, "v 3"]
     rotations: Float[np.ndarray, "v 3 3"]
-    jacobian: Float[np.ndarray, "m p"]
+    jacobian: Float[np.ndarray, "m p"]  # posed vertices by pose and translation
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,7 @@ class Fitter:
     arrays: object = field(repr=False)
     pattern: MeshPattern = field(repr=False)
     laplacian: csr_matrix = field(repr=False)
+    shape: ShapeOperators = field(repr=False)
 
     @staticmethod
     def of(model: BodyModel) -> Fitter:
@@ -92,12 +95,16 @@ class Fitter:
         # The paper's w: hands and feet, where scans are noisy (and hulls hardly resolve fingers), hold on to
         # the model.
         weight = np.where(np.isin(region, ("hand", "foot", "head")), 3.0, 1.0)
+        laplacian = edge_laplacian(model.faces, len(model.template), weight)
         return Fitter(
             model=model,
             coupling_weight=weight,
-            arrays=SkinningArrays.of(model),
+            # Without betas: `shape` knows what they do, and a Jacobian by each of them would cost most of the
+            # time.
+            arrays=SkinningArrays.of(model.with_betas(0)),
             pattern=MeshPattern.of(model.faces, len(model.template)),
-            laplacian=edge_laplacian(model.faces, len(model.template), weight),
+            laplacian=laplacian,
+            shape=ShapeOperators.of(model, laplacian),
         )
 
     @property
@@ -131,19 +138,18 @@ class Fitter:
     def linearised(
         self, state: BodyState, joints: Float[np.ndarray, "j 3"] | None
     ) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3 3"], Float[np.ndarray, "m p"]]:
-        """Posed vertices, dv/dT (V 3 3), and dv/d(pose, translation, betas through the joints) (3V, P)."""
+        """Posed vertices, dv/dT (V 3 3), and dv/d(pose, translation) (3V, 3J + 3)."""
         from fit.body.skinning import skin_with_jacobian
 
-        free_joints = joints is None
         joints = self.joints(state.betas) if joints is None else joints
         vertices, rotations, jacobian = skin_with_jacobian(
             self.arrays, state.template, joints, state.pose, state.translation
         )
-        jacobian = np.asarray(jacobian).reshape(3 * len(state.template), -1)
-        if not free_joints:
-            jacobian = jacobian.copy()
-            jacobian[:, self.n_pose + 3 :] = 0.0
-        return np.asarray(vertices), np.asarray(rotations), jacobian
+        return (
+            np.asarray(vertices),
+            np.asarray(rotations),
+            np.asarray(jacobian).reshape(3 * len(state.template), -1),
+        )
 
 
 @dataclass(frozen=True)
@@ -246,75 +252,92 @@ class Objective:
             float(self.point_terms(closest)[0].sum()) + self.prior_energy(state) + (held[0] if held else 0.0)
         )
 
-    def _active(self) -> Int[np.ndarray, "a"]:
-        n_pose, n_betas = self.fitter.n_pose, self.fitter.model.shape_directions.shape[2]
+    def _active(self) -> tuple[Int[np.ndarray, "a"], int]:
+        """Which columns of (pose, translation) may change, and how many of the first betas."""
         u = self.unknowns
-        return np.flatnonzero(
-            np.r_[np.full(n_pose, u.pose), np.full(3, u.translation), np.full(n_betas, u.betas)]
-        )
+        columns = np.flatnonzero(np.r_[np.full(self.fitter.n_pose, u.pose), np.full(3, u.translation)])
+        n_betas = self.fitter.model.n_betas
+        return columns, (min(n_betas, n_betas if u.n_betas is None else u.n_betas) if u.betas else 0)
 
-    def _parameter_priors(self, state: BodyState) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p"]]:
-        """Hessian and right-hand side of the priors on (pose, translation, betas)."""
+    def _parameter_priors(
+        self, state: BodyState, columns: Int[np.ndarray, "a"], n_betas: int
+    ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p"]]:
+        """Hessian and right-hand side of the priors on the active (pose, translation) and betas."""
         w, n_pose = self.weights, self.fitter.n_pose
-        size = n_pose + 3 + len(state.betas)
-        hessian, rhs = np.zeros((size, size)), np.zeros(size)
+        hessian, rhs = np.zeros((n_pose + 3, n_pose + 3)), np.zeros(n_pose + 3)
         hessian[3:n_pose, 3:n_pose] = w.pose_prior * self.pose_precision
         half = terms.gaussian_prior(state.pose[1:].ravel(), self.pose_mean, self.pose_precision)[1]
         rhs[3:n_pose] = -w.pose_prior * half
-        beta = slice(n_pose + 3, size)
-        hessian[beta, beta] += w.shape_prior * np.eye(len(state.betas))
-        rhs[beta] -= w.shape_prior * state.betas
-        return hessian, rhs
+        return (
+            block_diag(hessian[np.ix_(columns, columns)], w.shape_prior * np.eye(n_betas)),
+            np.concatenate([rhs[columns], -w.shape_prior * state.betas[:n_betas]]),
+        )
+
+    def _by_joints(self, state: BodyState, n_betas: int) -> Float[np.ndarray, "m b"]:
+        """Q of the active betas: zero where the joints are held."""
+        if self.joints is not None or n_betas == 0:
+            return np.zeros((self.fitter.n_pose, n_betas))
+        return self.fitter.shape.offsets_by_betas(state.pose)[:, :n_betas]
 
     def parameter_step(self, lin: _Linearised, state: BodyState, damping: float) -> tuple[None, np.ndarray]:
         """Step of pose, translation and betas alone; the template moves with M(beta)."""
-        model, active = self.fitter.model, self._active()
-        jacobian = lin.jacobian[:, active]
-        n_before = self.fitter.n_pose + 3
-        betas = active[active >= n_before] - n_before
-        if len(betas) and self.target is None:
-            shape = np.einsum("vab,vbk->vak", lin.rotations, model.shape_directions[:, :, betas])
-            jacobian = jacobian.copy()
-            jacobian[:, -len(betas) :] += shape.reshape(len(jacobian), -1)
-        hessian, rhs = self._parameter_priors(state)
-        hessian = hessian[np.ix_(active, active)] + jacobian.T @ (lin.hessian @ jacobian)
-        rhs = rhs[active] + jacobian.T @ lin.rhs.ravel()
+        shape, (columns, n_betas) = self.fitter.shape, self._active()
+        by_betas = shape.bone_spread @ self._by_joints(state, n_betas)
+        if n_betas and self.target is None:
+            template_moves = shape.shape[:, :n_betas].reshape(-1, 3, n_betas)
+            by_betas += (lin.rotations @ template_moves).reshape(len(by_betas), n_betas)
+        jacobian = np.concatenate([lin.jacobian[:, columns], by_betas], 1)
+        hessian, rhs = self._parameter_priors(state, columns, n_betas)
+        hessian += jacobian.T @ (lin.hessian @ jacobian)
+        rhs += jacobian.T @ lin.rhs.ravel()
         hessian[np.diag_indices_from(hessian)] += damping
-        step = np.zeros(lin.jacobian.shape[1])
-        step[active] = cho_solve(cho_factor(hessian), rhs)
-        return None, step
+        return None, self._whole_step(cho_solve(cho_factor(hessian), rhs), columns, n_betas)
+
+    def _whole_step(
+        self, active_step: Float[np.ndarray, "a"], columns: Int[np.ndarray, "c"], n_betas: int
+    ) -> Float[np.ndarray, "p"]:
+        """A step of the active parameters, written into one of all (pose, translation, betas)."""
+        n_before = self.fitter.n_pose + 3
+        step = np.zeros(n_before + self.fitter.model.n_betas)
+        step[columns] = active_step[: len(columns)]
+        step[n_before : n_before + n_betas] = active_step[len(columns) :]
+        return step
 
     def joint_step(
         self, lin: _Linearised, state: BodyState, damping: float
     ) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "p"]]:
         """Inexact Gauss-Newton step of template and parameters together."""
-        fitter, w = self.fitter, self.weights
-        model = fitter.model
-        n, size = len(model.template), lin.jacobian.shape[1]
-        active = self._active()
-        jacobian = lin.jacobian[:, active]
-        n_before = fitter.n_pose + 3
-        beta_columns = np.flatnonzero(active >= n_before) if self.target is None else np.zeros(0, int)
-        shape = model.shape_directions[:, :, active[beta_columns] - n_before]
+        fitter, w, shape = self.fitter, self.weights, self.fitter.shape
+        n = len(fitter.model.template)
+        columns, n_betas = self._active()
+        n_columns = len(columns)
+        by_joints = self._by_joints(state, n_betas)
+        coupled = n_betas > 0 and self.target is None
+        shape_pull = shape.pull(w.coupling, w.tether)[:, :n_betas] if coupled else None
 
         def pull(x: np.ndarray) -> np.ndarray:  # gradient of coupling and tether per template difference
             return w.coupling * (fitter.laplacian @ x) + w.tether * x
 
-        difference = self.difference(state)
-        prior_hessian, prior_rhs = self._parameter_priors(state)
-        prior_hessian = prior_hessian[np.ix_(active, active)]
+        prior_hessian, rhs_parameters = self._parameter_priors(state, columns, n_betas)
         prior_hessian[np.diag_indices_from(prior_hessian)] += damping
-        pulled = pull(difference)
-        rhs_template = np.einsum("vba,vb->va", lin.rotations, lin.rhs) - pulled
-        rhs_parameters = prior_rhs[active] + jacobian.T @ lin.rhs.ravel()
-        rhs_parameters[beta_columns] += np.einsum("vak,va->k", shape, pulled)
+        if coupled:
+            prior_hessian[n_columns:, n_columns:] += shape.stiffness(w.coupling, w.tether)[:n_betas, :n_betas]
+        difference = self.difference(state)
+        rhs_template = np.einsum("vba,vb->va", lin.rotations, lin.rhs) - pull(difference)
+        # Moves of posed vertices: by pose and translation, and by the bones' offsets (K), which betas change.
+        moves = lin.jacobian[:, columns]
+        if n_betas:
+            moves = np.concatenate([moves, shape.bone_spread], 1)
 
-        h_jacobian = lin.hessian @ jacobian
-        dense = prior_hessian + jacobian.T @ h_jacobian
-        if len(beta_columns):
-            flat = shape.reshape(3 * n, -1)
-            pulled_shape = np.stack([pull(shape[:, :, k]).ravel() for k in range(shape.shape[2])], axis=1)
-            dense[np.ix_(beta_columns, beta_columns)] += flat.T @ pulled_shape
+        def narrowed(x: np.ndarray) -> np.ndarray:  # from moves to parameters
+            return np.concatenate([x[:n_columns], by_joints.T @ x[n_columns:]]) if n_betas else x
+
+        rhs_parameters += narrowed(moves.T @ lin.rhs.ravel())
+        if shape_pull is not None:
+            rhs_parameters[n_columns:] += shape_pull.T @ difference.ravel()
+
+        of_moves = moves.T @ (lin.hessian @ moves)
+        dense = prior_hessian + narrowed(narrowed(of_moves).T).T
         dense_factor = cho_factor(dense)
         trace = lin.hessian.diagonal().reshape(n, 3).mean(1)
         scalar = splu(
@@ -325,15 +348,15 @@ class Objective:
         )
 
         def product(x: np.ndarray) -> np.ndarray:
-            xt, xp = x[: 3 * n].reshape(n, 3), x[3 * n :]
-            moved = np.einsum("vab,vb->va", lin.rotations, xt).ravel() + jacobian @ xp
+            xt, xp, betas = x[: 3 * n].reshape(n, 3), x[3 * n :], x[3 * n + n_columns :]
+            widened = np.concatenate([xp[:n_columns], by_joints @ betas]) if n_betas else xp
+            moved = np.einsum("vab,vb->va", lin.rotations, xt).ravel() + moves @ widened
             force = lin.hessian @ moved
-            relative = xt - shape @ xp[beta_columns] if len(beta_columns) else xt
-            pulled_x = pull(relative)
-            out_t = np.einsum("vba,vb->va", lin.rotations, force.reshape(n, 3)) + pulled_x
-            out_p = prior_hessian @ xp + jacobian.T @ force
-            if len(beta_columns):
-                out_p[beta_columns] -= np.einsum("vak,va->k", shape, pulled_x)
+            out_t = np.einsum("vba,vb->va", lin.rotations, force.reshape(n, 3)) + pull(xt)
+            out_p = prior_hessian @ xp + narrowed(moves.T @ force)
+            if shape_pull is not None:
+                out_t -= (shape_pull @ betas).reshape(n, 3)
+                out_p[n_columns:] -= shape_pull.T @ xt.ravel()
             return np.concatenate([out_t.ravel(), out_p])
 
         def precondition(r: np.ndarray) -> np.ndarray:
@@ -344,9 +367,7 @@ class Objective:
         solution = conjugate_gradients(
             product, precondition, np.concatenate([rhs_template.ravel(), rhs_parameters])
         )
-        step = np.zeros(size)
-        step[active] = solution[3 * n :]
-        return solution[: 3 * n].reshape(n, 3), step
+        return solution[: 3 * n].reshape(n, 3), self._whole_step(solution[3 * n :], columns, n_betas)
 
     def moved(
         self, state: BodyState, template_step: Float[np.ndarray, "v 3"] | None, step: Float[np.ndarray, "p"]
