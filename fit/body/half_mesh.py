@@ -15,6 +15,8 @@ from skimage.measure import marching_cubes
 
 from .anatomy import make_person
 from .anthropometry import measure
+from .foot import foot_of, toe_gaps
+from .hand import Hand, hand_of
 from .head import Head, feature_lines, head_of
 from .implicit import ImplicitBody
 from .plan import plan
@@ -24,9 +26,10 @@ from .skeleton import JOINT
 
 N_VERTICES = 6890
 # Edge lengths by place; the body's is the price of the face's.
-TRUNK_EDGE_M, PALM_EDGE_M, FINGER_EDGE_M = 0.0252, 0.0090, 0.0078
-HEEL_EDGE_M, TOE_EDGE_M = 0.0145, 0.0090
+TRUNK_EDGE_M, PALM_EDGE_M, FINGER_EDGE_M, TIP_EDGE_M = 0.0252, 0.0110, 0.0073, 0.0060
+HEEL_EDGE_M, TOE_EDGE_M = 0.0165, 0.0068
 SKULL_EDGE_M, FACE_EDGE_M = 0.0175, 0.0095
+REACH_OF_LINES_M = 0.004
 SNAP = 0.4  # of an edge length: vertices as near as this to a feature line lie on it
 FACE_DETAIL = (  # place (see `head`), reach in x, y, z, edge length there
     ((0.0320, 0.500, 0.078), (0.020, 0.014, 0.020), 0.0042),  # eye
@@ -82,18 +85,21 @@ def weld(
 
 
 def wanted_edge(
-    head: Head, joints: Float[np.ndarray, "24 3"]
+    head: Head, hand: Hand, joints: Float[np.ndarray, "24 3"]
 ) -> Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]:
     """Edge length in metres by place, as the constants above say."""
     wrist_x = float(joints[JOINT["left_wrist"], 0])
     toes_z = float(joints[JOINT["left_foot"], 2])
+    tips = hand.tips()
     centres = np.stack([head.at(*place) for place, _, _ in FACE_DETAIL])
 
     def wanted(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         x, y, z = points.T
         edge = TRUNK_EDGE_M + (PALM_EDGE_M - TRUNK_EDGE_M) * smooth_step(wrist_x - 0.09, wrist_x + 0.03, x)
         edge += (FINGER_EDGE_M - PALM_EDGE_M) * smooth_step(wrist_x + 0.05, wrist_x + 0.09, x)
-        foot = HEEL_EDGE_M + (TOE_EDGE_M - HEEL_EDGE_M) * smooth_step(toes_z - 0.02, toes_z + 0.02, z)
+        from_tip = np.linalg.norm(points[:, None] - tips, axis=2).min(1)
+        edge = np.minimum(edge, TIP_EDGE_M + (edge - TIP_EDGE_M) * smooth_step(0.008, 0.025, from_tip))
+        foot = HEEL_EDGE_M + (TOE_EDGE_M - HEEL_EDGE_M) * smooth_step(toes_z - 0.02, toes_z + 0.025, z)
         edge = np.minimum(edge, TRUNK_EDGE_M + (foot - TRUNK_EDGE_M) * smooth_step(0.16, 0.03, y))
         in_face = smooth_step(0.01, 0.06, z) * smooth_step(
             head.chin + 0.85 * head.height, head.chin + 0.6 * head.height, y
@@ -126,31 +132,32 @@ def settle_count(mesh: Remesher, target: int) -> None:
     raise AssertionError(f"remeshing stopped at {mesh.n_mirrored()} vertices instead of {target}")
 
 
-def on_skin(body: ImplicitBody, line: Float[np.ndarray, "k 3"], n: int = 40) -> Float[np.ndarray, "n 3"]:
-    """A polyline near the skin, resampled and brought onto it along z."""
-    p = np.stack(
-        [np.interp(np.linspace(0, len(line) - 1, n), np.arange(len(line)), line[:, i]) for i in range(3)], 1
-    )
-    depth = np.linspace(-0.03, 0.03, 121)
-    column = p[:, None] + depth[None, :, None] * np.array([0, 0, 1.0])
+def on_skin(
+    body: ImplicitBody, line: Float[np.ndarray, "k 3"], axis: int, n: int = 40
+) -> Float[np.ndarray, "n 3"]:
+    """A polyline near the skin, resampled and moved along a coordinate axis onto the skin, its high end."""
+    station = np.linspace(0, len(line) - 1, n)
+    p = np.stack([np.interp(station, np.arange(len(line)), line[:, i]) for i in range(3)], 1)
+    depth = np.linspace(-0.03, 0.03, 241)
+    column = p[:, None] + depth[None, :, None] * np.eye(3)[axis]
     value = body(column.reshape(-1, 3)).reshape(n, -1)
-    last_inside = value.shape[1] - 1 - (value[:, ::-1] < 0).argmax(1)
-    p[:, 2] += depth[last_inside]
-    return p
+    outermost = value.shape[1] - 1 - (value[:, ::-1] < 0).argmax(1)
+    p[:, axis] += depth[outermost]
+    return p[(value < 0).any(1)]
 
 
 def pull_to_lines(
     points: Float[np.ndarray, "n 3"],
     on_seam: np.ndarray,
     size: Float[np.ndarray, "n"],
-    lines: Sequence[Float[np.ndarray, "k 3"]],
+    lines: Sequence[Float[np.ndarray, "_ 3"]],
 ) -> Float[np.ndarray, "n 3"]:
     """Vertices within SNAP edge lengths of a line move onto it, so that edges run along lids and lips."""
     p = points.copy()
-    near = np.flatnonzero(
-        (p > np.min([q.min(0) for q in lines], 0) - 0.005).all(1)
-        & (p < np.max([q.max(0) for q in lines], 0) + 0.005).all(1)
-    )
+    low = np.stack([line.min(0) for line in lines]) - REACH_OF_LINES_M
+    high = np.stack([line.max(0) for line in lines]) + REACH_OF_LINES_M
+    in_box = np.all((p[:, None] > low) & (p[:, None] < high), axis=2)
+    near = np.flatnonzero(in_box.any(axis=1))
     best, target = np.full(len(near), np.inf), p[near].copy()
     for line in lines:
         for a, b in itertools.pairwise(line):
@@ -180,7 +187,8 @@ def make_half_mesh(
         joints[JOINT["left_shoulder"], 1],
         joints[JOINT["left_wrist"], 0],
     )
-    head = head_of(plan(person))
+    own_plan = plan(person)
+    head = head_of(own_plan)
     axes = (
         graded_axis(
             [(0.0, 0.16, 0.008), (0.16, wrist_x - 0.02, 0.011), (wrist_x - 0.02, wrist_x + 0.24, 0.0032)]
@@ -202,9 +210,10 @@ def make_half_mesh(
     v, f = weld(np.round(v, 6), f)
     progress()
 
-    wanted = wanted_edge(head, joints)
+    wanted = wanted_edge(head, hand_of(own_plan), joints)
     size_factor = 1.03
-    lines = [on_skin(body, line) for line in feature_lines(head)]
+    lines = [on_skin(body, line, axis=2) for line in feature_lines(head)]
+    lines += [on_skin(body, line, axis=1) for line in toe_gaps(foot_of(own_plan))]
 
     def settle(points: np.ndarray, on_seam: np.ndarray) -> np.ndarray:
         points = body.project(points, on_seam=on_seam, steps=1)

@@ -154,7 +154,7 @@ def lid_crease(head: Head) -> Float[np.ndarray, "k 3"]:
     )
 
 
-def feature_lines(head: Head) -> list[Float[np.ndarray, "k 3"]]:
+def feature_lines(head: Head) -> list[Float[np.ndarray, "_ 3"]]:
     """Lines that the mesh's vertices shall lie on: the rims of the lids and the line between the lips."""
     return [*arcs_of(eye_opening(head)), lid_crease(head), mouth_line(head)]
 

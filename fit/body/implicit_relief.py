@@ -4,7 +4,6 @@ A relief is a primitive whose `distance` is added to what is there already: -1 m
 millimetre.
 """
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -53,65 +52,84 @@ class Opening:
     edge_m: float
 
 
-def _to_polyline(
-    points: Float[np.ndarray, "n 3"], line: Float[np.ndarray, "k 3"], depth: float
-) -> Float[np.ndarray, "n"]:
-    """Squared distance, z counted `depth` times."""
-    metric = np.array([1.0, 1.0, depth])
-    p, corner = points * metric, line * metric
-    best = np.full(len(p), np.inf)
-    for a, b in itertools.pairwise(corner):
-        q, e = p - a, b - a
-        h = np.clip(q @ e / (e @ e), 0, 1)
-        d = q - h[:, None] * e
-        best = np.minimum(best, (d * d).sum(1))
-    return best
-
-
 class Relief:
-    """Many bumps, ridges and openings as one primitive."""
+    """Many bumps, ridges and openings as one primitive.
+
+    All squared distances are quadratic forms of the point, so that one matrix product serves all bumps and
+    one all segments of all ridges.
+    """
 
     carries = False
     displaces = True
     blend_m = 0.0
 
     def __init__(self, forms: Sequence[Bump | Ridge | Opening]) -> None:
-        bumps = [form for form in forms if isinstance(form, Bump)]
+        self.bumps = [form for form in forms if isinstance(form, Bump)]
         self.ridges = [form for form in forms if isinstance(form, Ridge)]
         self.openings = [form for form in forms if isinstance(form, Opening)]
-        self.centre_of_bump = np.array([b.centre for b in bumps], dtype=np.float64).reshape(-1, 3)
-        self.sigma = np.array([b.sigma_m for b in bumps], dtype=np.float64).reshape(-1, 3)
-        self.height = np.array([b.height_m for b in bumps], dtype=np.float64)
-        lines = [np.asarray(r.line, dtype=np.float64) for r in self.ridges]
-        self.lines = lines
-        corners = [np.asarray(o.corners, dtype=np.float64) for o in self.openings]
-        reach = self.sigma * REACH_SIGMAS
-        margins = [r.sigma_m * REACH_SIGMAS for r in self.ridges]
-        rims = [o.rise_m + o.drop_m + o.edge_m for o in self.openings]
-        self.low = np.concatenate(
-            [self.centre_of_bump - reach]
-            + [line - margin for line, margin in zip(lines, margins, strict=True)]
-            + [corner - rim for corner, rim in zip(corners, rims, strict=True)]
-        ).min(0)
-        self.high = np.concatenate(
-            [self.centre_of_bump + reach]
-            + [line + margin for line, margin in zip(lines, margins, strict=True)]
-            + [corner + rim for corner, rim in zip(corners, rims, strict=True)]
-        ).max(0)
+        boxes = [_box_of(form) for form in forms]
+        self.low = np.min([low for low, _ in boxes], axis=0)
+        self.high = np.max([high for _, high in boxes], axis=0)
+        self.origin = 0.5 * (self.low + self.high)
+        centres = np.array([b.centre for b in self.bumps]).reshape(-1, 3) - self.origin
+        sigmas = np.array([b.sigma_m for b in self.bumps]).reshape(-1, 3)
+        self.bump_form = _quadratic(centres, sigmas**-2)
+        self.bump_height = np.array([b.height_m for b in self.bumps])
+        self._prepare_segments()
+
+    def _prepare_segments(self) -> None:
+        start: list[np.ndarray] = []
+        edge: list[np.ndarray] = []
+        metric: list[np.ndarray] = []
+        first: list[int] = []
+        for ridge in self.ridges:
+            line = np.asarray(ridge.line, dtype=np.float64) - self.origin
+            first.append(len(start))
+            start += list(line[:-1])
+            edge += list(np.diff(line, axis=0))
+            metric += [np.array([1.0, 1.0, ridge.depth**2])] * (len(line) - 1)
+        self.first_segment = np.array(first, dtype=np.int64)
+        if not self.ridges:
+            return
+        a, e, w = np.array(start), np.array(edge), np.array(metric)
+        self.from_start = _quadratic(a, w)
+        self.along = np.concatenate([(w * e).T, -(w * e * a).sum(1)[None]])  # of (x, y, z, 1)
+        self.edge2 = (w * e * e).sum(1)
+        self.ridge_height = np.array([r.height_m for r in self.ridges])
+        self.ridge_sigma = np.array([r.sigma_m for r in self.ridges])
 
     def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Metres to add to the distance so far."""
-        raised = np.zeros(len(points))
-        for centre, sigma, height in zip(self.centre_of_bump, self.sigma, self.height, strict=True):
-            q = (points - centre) / sigma
-            raised += height * np.exp(-0.5 * (q * q).sum(1))
-        for ridge, line in zip(self.ridges, self.lines, strict=True):
-            raised += ridge.height_m * np.exp(
-                -0.5 * _to_polyline(points, line, ridge.depth) / ridge.sigma_m**2
-            )
+        p = points - self.origin
+        terms = np.concatenate([p * p, p, np.ones((len(p), 1))], 1)
+        raised = np.exp(-0.5 * (terms @ self.bump_form)) @ self.bump_height
+        if self.ridges:
+            along = terms[:, 3:] @ self.along
+            h = np.clip(along / self.edge2, 0, 1)
+            away2 = terms @ self.from_start - h * (2 * along - h * self.edge2)
+            nearest2 = np.minimum.reduceat(away2, self.first_segment, axis=1)
+            raised += np.exp(-0.5 * nearest2 / self.ridge_sigma**2) @ self.ridge_height
         for opening in self.openings:
             raised -= opening.depth_m * _inside(opening, points)
         return -raised
+
+
+def _quadratic(
+    centre: Float[np.ndarray, "k 3"], factor: Float[np.ndarray, "k 3"]
+) -> Float[np.ndarray, "7 k"]:
+    """The coefficients that make sum(factor (p - centre)^2) of (x2, y2, z2, x, y, z, 1)."""
+    return np.concatenate([factor.T, (-2 * factor * centre).T, (factor * centre**2).sum(1)[None]])
+
+
+def _box_of(form: Bump | Ridge | Opening) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Corners of the box beyond which the form counts as zero."""
+    if isinstance(form, Bump):
+        at, reach = np.array([form.centre]), np.asarray(form.sigma_m) * REACH_SIGMAS
+    elif isinstance(form, Ridge):
+        at, reach = np.asarray(form.line), np.full(3, form.sigma_m * REACH_SIGMAS)
+    else:
+        at, reach = np.asarray(form.corners), np.full(3, form.rise_m + form.drop_m)
+    return at.min(0) - reach, at.max(0) + reach
 
 
 def arcs_of(opening: Opening, n: int = 9) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
