@@ -107,7 +107,7 @@ def toe_gaps(foot: Foot) -> list[Float[np.ndarray, "2 3"]]:
 def foot_forms(b: Build, foot: Foot) -> list[Bump]:
     ankle, lean = b.joint("left_ankle"), 1 - 0.6 * float(np.clip(b.m.fat / 0.3, -0.4, 1.2))
     return [
-        Bump(foot.at(0.430, -0.034, 0.000), (0.015, 0.018, 0.036), -0.0140),  # arch
+        Bump(foot.at(0.430, -0.034, 0.000), (0.016, 0.018, 0.029), -0.0140),  # arch
         Bump(ankle + np.array([0.036, -0.006, -0.008]), (0.010, 0.011, 0.009), 0.0028 * lean),  # ankle bones
         Bump(ankle + np.array([-0.036, 0.006, 0.004]), (0.010, 0.012, 0.010), 0.0025 * lean),
         Bump(
