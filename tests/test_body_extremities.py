@@ -169,14 +169,14 @@ def test_the_sole_is_flat_and_its_arch_hollow(half: Mesh, carrier: Carrier, sex:
     side = (v - foot.heel) @ sideways / (sideways @ sideways)
     facing_down = (v[:, 1] < 0.03) & (vertex_normals(v, half[1])[:, 1] < -0.95)
     heel = facing_down & (along > 0.06) & (along < 0.20)
-    ball = facing_down & (along > 0.62) & (along < 0.74)
+    ball = facing_down & (along > 0.62) & (along < 0.74) & (abs(side) < 0.030)  # its rim is round
     arch = (v[:, 1] < 0.03) & (along > 0.36) & (along < 0.5) & (side < -0.012) & (side > -0.026)
     assert heel.sum() >= 3
     assert ball.sum() > 5
     assert np.abs(v[heel | ball, 1]).max() < 0.002
-    assert v[arch, 1].max() > 0.004
+    assert v[arch, 1].max() > 0.008
     assert v[:, 1].min() > -0.002
-    assert along.max() == pytest.approx(1.0, abs=0.02)
+    assert along[v[:, 1] < 0.10].max() == pytest.approx(1.0, abs=0.02)
 
 
 @pytest.mark.parametrize(("sex", "bmi"), PEOPLE)

@@ -28,12 +28,13 @@ FOOT = (
     (0.835, -0.006, 0.010, 0.0380, 0.0300, 0.005, 0.009),
 )
 TOES = (  # root and tip: fraction, side, up and radius; the big one first
-    ((0.700, -0.0300, 0.0200, 0.0175), (0.945, -0.0265, 0.0126, 0.0126)),
+    ((0.700, -0.0300, 0.0178, 0.0175), (0.945, -0.0265, 0.0126, 0.0126)),
     ((0.700, -0.0085, 0.0180, 0.0120), (0.953, -0.0050, 0.0076, 0.0074)),
     ((0.695, 0.0080, 0.0165, 0.0115), (0.925, 0.0100, 0.0073, 0.0071)),
     ((0.680, 0.0220, 0.0150, 0.0110), (0.885, 0.0240, 0.0070, 0.0068)),
     ((0.660, 0.0350, 0.0135, 0.0110), (0.835, 0.0370, 0.0067, 0.0065)),
 )
+MEAN_LENGTH_M = 0.258
 TOE_BLEND_M = 0.0025
 
 
@@ -81,8 +82,10 @@ def add_foot(body: ImplicitBody, b: Build) -> None:
         Loft(foot.heel, foot.forward, sideways, (0, 1, 0), rows, along, 0.035, (0.012, 0.012), blur=0.02)
     )
     for root, tip in TOES:
-        ends = foot.at(*root[:3]), foot.at(*tip[:3])
         radii = root[3] * foot.width, tip[3] * foot.width
+        # The toe's end, not its centre, keeps its place: broad feet are not longer.
+        tip_fraction = tip[0] + tip[3] / MEAN_LENGTH_M - radii[1] / foot.length
+        ends = foot.at(*root[:3]), foot.at(tip_fraction, *tip[1:3])
         body.add(Cone(*ends, *radii, TOE_BLEND_M, carries=True))
     body.add(Relief(foot_forms(b, foot)))
 
