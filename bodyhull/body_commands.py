@@ -31,7 +31,8 @@ class BodyConvert:
     """Write a body file as an .npz of plain arrays under SMPL's keys, with its own joints."""
 
     file: FileArgument
-    """An .npz or .pkl of SMPL, SMPL-H or SMPL-X; or free:neutral, free:female, free:male."""
+    """An .npz or .pkl of SMPL, SMPL-H or SMPL-X; or free:neutral, free:female, free:male; or anny,
+    anny:FOLDER (made into SMPL's structure)."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT.npz")]
     """File to write."""
     overwrite: bool = False
@@ -84,7 +85,12 @@ def opened(spec: str) -> tuple[BodyFile, BodyModel]:
     if spec.startswith("free:"):
         model = load_body(spec)
         return model.as_file(), model
-    file = read_body_file(spec)
+    if spec == "anny" or spec.startswith("anny:"):
+        from fit.body.anny import anny_body_file
+
+        file = anny_body_file(Path(spec.removeprefix("anny:")) if ":" in spec else None)
+    else:
+        file = read_body_file(spec)
     return file, BodyModel.of_file(file, spec)
 
 
@@ -140,6 +146,8 @@ def convert(command: BodyConvert) -> None:
         raise UserError(f"{command.out}: is there already; --overwrite replaces it")
     file, model = opened(command.file)
     file.save(command.out)
+    for note in file.notes:
+        print(f"note          {note}")
     print(f"{command.out}: {file.kind}, {len(file.parents)} joints, {file.shape_directions.shape[2]} betas")
     print(f"hash          {model.content_hash}")
 
