@@ -168,6 +168,10 @@ def test_every_dependency_is_used_and_every_library_is_a_dependency() -> None:
     }  # fmt: skip
     as_modules = {modules.get(name, name) for name in named}
     used = {name.split(".")[0] for path in MODULES for _, name in imports(path)}
+    extra = project["optional-dependencies"]["bodies"]
+    assert [text.split("[")[0] for text in extra] == ["body-models"], "the one library that is optional"
+    assert not any("body_models" in n for p in MODULES for _, n in imports(p, at_module_level=True))
+    used -= {"body_models"}
     third_party = used - set(sys.stdlib_module_names) - set(MAY_IMPORT)
     assert third_party - as_modules <= {"OpenGL"}, "used, but no dependency (PyOpenGL comes with pyrender)"
     assert as_modules - third_party == set(), "a dependency that nothing uses"
