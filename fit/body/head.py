@@ -199,7 +199,7 @@ def face_forms(head: Head) -> list[Bump | Ridge | Opening]:
             0.0038 - 0.0006 * sex,
             flat,
         ),
-        ridge(mouth_line(head), 0.0016, -0.0036, flat),
+        ridge(mouth_line(head), 0.0024, -0.0040, flat),
         bump((0.0265, 0.196, 0.085), (0.0035, 0.0040, 0.02), -0.0018),
         bump((0.0, 0.258, 0.1), (0.0030, 0.0065, 0.02), -0.0012),
         ridge(
