@@ -236,6 +236,14 @@ def test_a_key_says_more_than_a_name(tmp_path: Path, arrays: Arrays) -> None:
     assert load_body(tmp_path / "male.npz").gender == "female"
 
 
+def test_names_are_kept_to_one_printable_line(tmp_path: Path, arrays: Arrays) -> None:
+    np.savez(
+        tmp_path / "body.npz", **arrays, name=np.array("a\nb\x1b[2Jc" + 500 * "d"), licence=np.array("mine\t")
+    )
+    file = read_body_file(tmp_path / "body.npz")
+    assert file.name.startswith("a b [2Jc") and len(file.name) == 200 and file.licence == "mine"
+
+
 def test_the_free_bodies_know_their_gender(tmp_path: Path) -> None:
     for sex in ("neutral", "female", "male"):
         assert load_body(f"free:{sex}", show_progress=False).gender == sex

@@ -153,8 +153,8 @@ def read_body_file(path: str | Path) -> BodyFile:
     notes = [f"{found[key]} is read as {key}" for key in SPELLINGS if found[key] != key]
     shapes, expressions = _shape_and_expression(archive, kind, shapes, notes)
     return BodyFile(
-        name=archive.text("name") if "name" in archive.names else _name_of(path),
-        licence=archive.text("licence") if "licence" in archive.names else NO_LICENCE,
+        name=_one_line(archive.text("name")) if "name" in archive.names else _name_of(path),
+        licence=_one_line(archive.text("licence")) if "licence" in archive.names else NO_LICENCE,
         kind=kind,
         gender=_gender(archive),
         template=template,
@@ -252,6 +252,11 @@ def _shape_and_expression(
             else f"all {width} components are taken for shape, none for expression"
         )
     return np.ascontiguousarray(directions[:, :, :n_shape]), np.ascontiguousarray(directions[:, :, n_shape:])
+
+
+def _one_line(text: str) -> str:
+    """Text of unknown origin as a terminal can show it."""
+    return "".join(c if c.isprintable() else " " for c in text[:200]).strip()
 
 
 def _name_of(path: Path) -> str:
