@@ -5,13 +5,13 @@
     python -m benchmarks.body_pose --speed            # forward and Jacobian; theirs where it is installed
 
 Volume is counted of the whole body and of the segment around the joint alone (its part labels, closed by a
-fan over each open end), because the whole hides a pinch. Times are the least of the repetitions, one thread.
+fan over each open end), because the whole hides a pinch. Times are the least of the repetitions, both
+libraries in one process and in double precision.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
 import tempfile
 import time
 from collections.abc import Callable
@@ -284,5 +284,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     main()

@@ -8,9 +8,10 @@ from scipy.optimize import nnls
 
 from .skeleton import JOINT_NAMES, MIRROR
 
-N_CANDIDATES = 130  # per joint: every third of the nearest vertices
+N_CANDIDATES = 240  # per joint, of the nearest vertices
+STRIDE = 5  # of them: every fifth is enough, the skin is smooth
 SUM_WEIGHT = 30.0  # how hard a row is asked to sum to one, against metres of error
-SHRINKAGE = 0.05
+SHRINKAGE = 0.015  # small against the millimetres that are at stake, large enough to spread the weight
 
 
 def fit_joint_regressor(
@@ -29,7 +30,7 @@ def fit_joint_regressor(
             continue
         on_midline = MIRROR[j] == j
         nearest = np.argsort(np.linalg.norm(mean - mean_joints[j], axis=1), kind="stable")
-        candidates = nearest[: 3 * N_CANDIDATES : 3]
+        candidates = nearest[: STRIDE * N_CANDIDATES : STRIDE]
         axes = slice(1, 3) if on_midline else slice(0, 3)
         matrix = halves[:, candidates, axes].transpose(0, 2, 1).reshape(-1, N_CANDIDATES)
         matrix = np.vstack([matrix, np.full((1, N_CANDIDATES), SUM_WEIGHT), np.eye(N_CANDIDATES) * SHRINKAGE])
