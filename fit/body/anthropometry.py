@@ -37,6 +37,7 @@ RESTING_FROM_FLEXED_FOREARM = 0.97
 HEAD_HEIGHT_FROM_PARTS = 0.912  # chin to crown, from (tragion to crown) + (chin to sellion)
 UPPER_ARM_FROM_ACROMION_RADIALE = 0.838  # joint centre to joint centre
 FOREARM_FROM_RADIALE_STYLION = 0.975
+CHEST_WITH_ARMS_RAISED = 1.12  # the latissimus spreads when the arms are held out
 
 
 @dataclass(frozen=True)
@@ -72,13 +73,17 @@ class Measurements:
     navel_height: float
     acromion_height: float
     cervicale_height: float
-    fat: float  # log of BMI over the survey's mean BMI of this sex
-    chest_depth: float  # log ratios at given stature and BMI: 0 is usual
-    belly_depth: float
-    buttock_depth: float
+    chest_breadth: float  # breadths and depths of the trunk where its girths are
+    chest_depth: float
+    waist_breadth: float
+    waist_depth: float
     hip_breadth: float
+    hip_depth: float
+    fat: float  # log of BMI over the survey's mean BMI of this sex
     muscle: float  # factors: 1 is usual (midway between the sexes for muscle)
     bust: float
+    fullness: float = 0.0
+    """Log of how much fuller the sections between the measured girths are than usual."""
 
     @property
     def weight(self) -> float:
@@ -86,6 +91,7 @@ class Measurements:
         return self.bmi * self.stature**2
 
 
+TRUNK_SECTIONS = ("chest", "waist", "hip")
 GIRTHS = ("neck", "chest", "waist", "hip", "thigh", "knee", "calf", "ankle", "biceps", "forearm", "wrist")
 
 
@@ -190,7 +196,7 @@ def measure(
     fat = log_bmi - survey_log_bmi
     arm_over_belly = residual["bicepscircumferenceflexed"] + residual["forearmcircumferenceflexed"]
     muscle_score = 12.0 * (arm_over_belly - 0.5 * residual["waistcircumference"]) + 0.6 * definition_score
-    breast = max(0.0, 1.0 - sex) * np.exp(0.35 * bust_score + 1.7 * fat)
+    breast = max(0.0, 1.0 - sex) * np.exp(0.35 * bust_score + 0.9 * fat)
     chest_of_men = 0.06 * float(np.clip(sex, 0, 1)) * np.exp(3 * fat)  # only fat builds one
     return Measurements(
         sex=float(sex),
@@ -223,10 +229,12 @@ def measure(
         acromion_height=value["acromialheight"],
         cervicale_height=value["cervicaleheight"],
         fat=fat,
-        chest_depth=residual["chestdepth"] - residual["chestbreadth"],
-        belly_depth=residual["waistdepth"] - residual["waistbreadth"],
-        buttock_depth=residual["buttockdepth"] - residual["buttockcircumference"],
-        hip_breadth=residual["hipbreadth"] - residual["buttockcircumference"],
+        chest_breadth=value["chestbreadth"] * CHEST_WITH_ARMS_RAISED,
+        chest_depth=value["chestdepth"],
+        waist_breadth=value["waistbreadth"],
+        waist_depth=value["waistdepth"],
+        hip_breadth=value["hipbreadth"],
+        hip_depth=value["buttockdepth"],
         muscle=float(np.exp(0.35 * np.clip(muscle_score, -2.5, 2.5) + 0.35 * (sex - 0.5))),
         bust=float(breast + chest_of_men),
     )

@@ -43,10 +43,11 @@ DECIMALS = 9  # of the stored arrays: a nanometre, so that a last bit of some BL
 LICENCE = "CC0-1.0"
 GENERATOR = (
     "anatomy.py", "ansur2.json", "anthropometry.py", "bends.py", "build.py", "correctives.py",
-    "correspondence.py", "dual_quaternions.py", "flesh.py", "foot.py", "half_mesh.py", "hand.py", "head.py",
-    "implicit.py", "implicit_relief.py", "joint_regressor.py", "local_variation.py", "parts.py", "plan.py",
-    "pose_prior.py", "ramp.py", "remesh.py", "sections.py", "shape_space.py", "skeleton.py",
-    "skin_weights.py", "smooth_variation.py", "stations.py",
+    "correspondence.py", "density.py", "dual_quaternions.py", "flesh.py", "foot.py", "girth_solver.py",
+    "half_mesh.py", "hand.py", "head.py", "implicit.py", "implicit_relief.py", "implicit_tape.py",
+    "joint_regressor.py", "limbs.py", "local_variation.py", "parts.py", "plan.py", "pose_prior.py",
+    "ramp.py", "remesh.py", "sections.py", "shape_space.py", "skeleton.py", "skin_weights.py",
+    "smooth_variation.py", "stations.py", "tape.py", "trunk.py",
 )  # fmt: skip
 
 

@@ -5,7 +5,7 @@ own tables, and a few Newton steps bring the result onto that body's skin.
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix, csr_matrix
 
 from .implicit import Cone, ImplicitBody, Loft
@@ -14,6 +14,8 @@ from .remesh import SEAM_TOLERANCE_M
 OFF_SEAM_M = 6e-4
 SOFTNESS_M = 0.015  # how fast the say of a farther primitive fades
 FARTHEST_M = 0.06
+OFF_SKIN_M = 1.5e-3
+MARGIN_M = 0.05  # a primitive shapes the vertices so near it on the template; on others it may be larger
 
 
 def neighbour_mean(faces: Int[np.ndarray, "f 3"], n_vertices: int) -> csr_matrix:
@@ -52,31 +54,49 @@ class Carrier:
     def _keep_sides(self, p: Float[np.ndarray, "h 3"]) -> None:
         p[:, 0] = np.where(self.seam, 0, np.maximum(p[:, 0], OFF_SEAM_M))
 
+    def _to_skin(
+        self,
+        body: ImplicitBody,
+        start: Float[np.ndarray, "n 3"],
+        on_seam: Bool[np.ndarray, "n"],
+        reached: list[Int[np.ndarray, "_"]],
+        n_steps: int,
+    ) -> Float[np.ndarray, "n 3"]:
+        """The way from `start` to the skin by chord Newton: one gradient serves all steps."""
+        p = start.copy()
+        value = body(p, reached)
+        gradient = np.empty_like(p)
+        for axis in range(3):
+            step = np.zeros(3)
+            step[axis] = 5e-4
+            gradient[:, axis] = (body(p + step, reached) - value) / 5e-4
+        gradient[on_seam, 0] = 0
+        gradient /= np.maximum((gradient * gradient).sum(1), 0.1)[:, None]
+        for step_idx in range(n_steps):
+            move = -value[:, None] * gradient
+            length = np.sqrt((move * move).sum(1))[:, None]
+            p += move * np.minimum(1, 0.02 / np.maximum(length, 1e-9))
+            p[:, 0] = np.where(on_seam, 0, np.maximum(p[:, 0], OFF_SEAM_M))
+            if step_idx < n_steps - 1:
+                value = body(p, reached)
+        return p - start
+
     def __call__(self, body: ImplicitBody) -> Float[np.ndarray, "h 3"]:
         """Half vertices on this body's skin, floor frame, metres."""
         decoded = np.zeros((self.n, 3))
         for i, index, code, weight in zip(self.ids, self.index, self.code, self.weight, strict=True):
             decoded[index] += body.primitives[i].decode(code) * weight  # type: ignore[attr-defined]
         self._keep_sides(decoded)
+        # The midline ends at the crotch; below it there is no skin that Newton's steps could find.
+        decoded[self.seam, 1] = np.maximum(decoded[self.seam, 1], body.crotch_y)
 
-        on_skin = decoded.copy()
-        value = body(on_skin, self.reached)
-        gradient = np.empty_like(on_skin)
-        for axis in range(3):
-            step = np.zeros(3)
-            step[axis] = 5e-4
-            gradient[:, axis] = (body(on_skin + step, self.reached) - value) / 5e-4
-        gradient[self.seam, 0] = 0
-        gradient /= np.maximum((gradient * gradient).sum(1), 0.1)[:, None]
-        for _ in range(3):  # chord Newton: one gradient serves all three steps
-            move = -value[:, None] * gradient
-            length = np.sqrt((move * move).sum(1))[:, None]
-            on_skin += move * np.minimum(1, 0.02 / np.maximum(length, 1e-9))
-            self._keep_sides(on_skin)
-            value = body(on_skin, self.reached)
-
-        correction = on_skin - decoded
+        correction = self._to_skin(body, decoded, self.seam, self.reached, 3)
         for _ in range(2):
             correction = 0.5 * correction + 0.5 * (self.smooth @ correction)
         correction[self.seam, 0] = 0
-        return decoded + correction
+        placed = decoded + correction
+        # Smoothing leaves some off the skin where it bends much (a large breast): those are brought back.
+        off = np.flatnonzero(np.abs(body(placed, self.reached)) > OFF_SKIN_M)
+        placed[off] += self._to_skin(body, placed[off], self.seam[off], body.reached(placed[off]), 2)
+        self._keep_sides(placed)
+        return placed

@@ -20,8 +20,8 @@ FINGERS = (  # name, sideways at the knuckle, knuckle and tip / hand length, rad
     ("little", -0.0295, 0.450, 0.790, 0.0076, 0.0059, -8.0),
 )
 PALM = (  # distance / hand length, up, down, front, back
-    (-0.08, 0.0190, 0.0190, 0.0275, 0.0265),
-    (0.05, 0.0178, 0.0182, 0.0285, 0.0268),
+    (-0.08, 0.0115, 0.0115, 0.0170, 0.0165),  # well inside the forearm: the union must not thicken the wrist
+    (0.05, 0.0165, 0.0170, 0.0270, 0.0255),
     (0.16, 0.0160, 0.0165, 0.0335, 0.0315),
     (0.28, 0.0145, 0.0145, 0.0380, 0.0365),
     (0.40, 0.0132, 0.0132, 0.0402, 0.0390),
@@ -65,10 +65,10 @@ def hand_of(b: Build) -> Hand:
 def add_hand(body: ImplicitBody, b: Build) -> None:
     hand = hand_of(b)
     width, plump = hand.width, hand.plump
-    rows = [
-        (f, 0, 0, up * width, down * width, front * width, back * width, 2.5, 2.5)
-        for f, up, down, front, back in PALM
-    ]
+    rows = []
+    for f, up, down, front, back in PALM:
+        q = width if f > 0.1 else b.ratio_mid["wrist"]  # the wrist's end follows the wrist
+        rows.append((f, 0, 0, up * q, down * q, front * q, back * q, 2.5, 2.5))
     along = [f * hand.length for f, *_ in PALM]
     body.add(Loft(hand.wrist, (1, 0, 0), (0, 1, 0), (0, 0, 1), rows, along, 0.02, (0.02, 0.009), blur=0.015))
     little_ball = np.array([0.036, 0.0110, 0.0130]) * plump

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float
 
-from .anthropometry import GIRTHS, Measurements, survey_mean
+from .anthropometry import GIRTHS, TRUNK_SECTIONS, Measurements, survey_mean
 from .skeleton import JOINT, LEFT_JOINTS, MIRROR
 
 FOOT_TURN_DEG = 7.0  # toes point outwards when standing
@@ -39,6 +39,7 @@ class Build:
     y: Callable[[float], float]
     ratio: dict[str, float]  # girths over those of the average of the same sex
     ratio_mid: dict[str, float]  # girths over those of the average midway between the sexes
+    depth: dict[str, float]  # log of depth / breadth of the trunk over that of the average of the same sex
     scale: float  # stature over 1.69 m
     joints: Float[np.ndarray, "24 3"]
     foot_forward: Vector
@@ -53,11 +54,18 @@ def plan(m: Measurements) -> Build:
     """Girth ratios and the joints (left ones placed, right ones mirrored)."""
     own, same_sex, between = asdict(m), asdict(survey_mean(m.sex)), asdict(survey_mean(0.5))
     ratio = {name: own[name] / same_sex[name] for name in (*GIRTHS, "biacromial")}
+    depth = {
+        name: float(
+            np.log(own[f"{name}_depth"] / same_sex[f"{name}_depth"])
+            - np.log(own[f"{name}_breadth"] / same_sex[f"{name}_breadth"])
+        )
+        for name in TRUNK_SECTIONS
+    }
     ratio_mid = {name: own[name] / between[name] for name in GIRTHS}
     y = height_map(m)
     scale = m.stature / 1.69
 
-    hip_x = 0.088 * (0.55 + 0.45 * ratio_mid["hip"]) * np.sqrt(scale) * np.exp(0.5 * m.hip_breadth)
+    hip_x = 0.088 * (0.55 + 0.45 * ratio_mid["hip"]) * np.sqrt(scale) * np.exp(-0.2 * depth["hip"])
     hip = np.array([hip_x, y(0.506), 0.0])
     ankle = np.array([hip_x + STANCE_M, y(0.0445), -0.030])
     share = (y(0.506) - y(0.277)) / (y(0.506) - y(0.0445))
@@ -94,4 +102,6 @@ def plan(m: Measurements) -> Build:
     for j in LEFT_JOINTS:
         joints[MIRROR[j]] = joints[j] * [-1, 1, 1]
     length = float(np.linalg.norm(ankle - hip))
-    return Build(m, y, ratio, ratio_mid, scale, joints, foot_forward, length * share, length * (1 - share))
+    return Build(
+        m, y, ratio, ratio_mid, depth, scale, joints, foot_forward, length * share, length * (1 - share)
+    )

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .anthropometry import Measurements
+from .anthropometry import Measurements, mix
 from .density import weight_kg
 from .plan import height_map
 from .sections import Cutter, GirthLine, unique_edges, volume_m3
@@ -23,14 +23,16 @@ UP = np.array([0.0, 1.0, 0.0])
 NECK_NORMAL = np.array([0.0, 0.88, 0.47])  # the neck leans forward, and the tape with it
 SHOULDER_TO_ACROMION_M = 0.030  # joint centre to the bone's edge, outwards, at a stature of STATURE_M
 STATURE_M = 1.69
-TRUNK_SHARES = {"chest": 0.764, "under_chest": 0.60, "waist": 0.367}
-"""Levels between the crotch (0) and the shoulder joint (1)."""
+TRUNK_SHARES = {"chest": (0.723, 0.770), "under_chest": (0.59, 0.62), "waist": (0.367, 0.367)}
+"""Levels between the crotch (0) and the shoulder joint (1), of women and of men."""
+CHEST_FRACTIONS = {"chest": (0.7195, 0.7352), "under_chest": (0.675, 0.686)}
+"""The same as fractions of the average stature, for `plan.height_map`."""
 HIP_SHARES = np.linspace(0.03, 0.20, 8)  # the fullest of these is the hip
 CALF_SHARES = np.linspace(0.20, 0.50, 7)  # from the knee to the ankle; the fullest
 ANKLE_SHARES = np.linspace(0.78, 1.0, 6)  # the slimmest
 FOREARM_SHARES = (0.15, 0.2, 0.25, 0.3, 0.35)  # from the elbow to the wrist; the fullest
 WRIST_SHARES = (0.90, 0.95, 1.0)  # the slimmest
-NECK_SHARES = (0.30, 0.45, 0.60, 0.75)  # from the neck joint to the head joint; the slimmest
+NECK_SHARES = (0.40, 0.60, 0.80, 1.00)  # from the neck joint to the head joint; the slimmest
 THIGH_BELOW_CROTCH = 0.030  # of stature: the gluteal furrow
 
 Choice = Callable[[list[float]], int]
@@ -50,7 +52,8 @@ class Levels:
     def of_person(m: Measurements) -> "Levels":
         """Where the survey's landmarks lie on this person, above the floor."""
         y = height_map(m)
-        return Levels(m.crotch_height, y(0.733), y(0.676), m.navel_height, y(0.450))
+        chest, under_chest = (y(mix(fractions, m.sex)) for fractions in CHEST_FRACTIONS.values())
+        return Levels(m.crotch_height, chest, under_chest, m.navel_height, y(0.450))
 
 
 class Subject:
@@ -63,6 +66,7 @@ class Subject:
         joints: Float[np.ndarray, "24 3"],
         parts: Int[np.ndarray, "v"],
         levels: Levels | None = None,
+        sex: float = 0.5,
     ) -> None:
         self.vertices, self.faces, self.joints = template, faces, joints
         self.cutter = Cutter(template, unique_edges(faces))
@@ -72,7 +76,7 @@ class Subject:
         self.on_head = parts == JOINT["head"]
         self.on_hand = np.isin(parts, _joints_named("wrist", "hand"))
         self.on_foot = np.isin(parts, _joints_named("ankle", "foot"))
-        self.levels = self._find_levels() if levels is None else levels
+        self.levels = self._find_levels(sex) if levels is None else levels
 
     @property
     def stature(self) -> float:
@@ -81,7 +85,7 @@ class Subject:
     def joint(self, name: str) -> Float[np.ndarray, "3"]:
         return self.joints[JOINT[name]]
 
-    def _find_levels(self) -> Levels:
+    def _find_levels(self, sex: float) -> Levels:
         across = np.array([1.0, 0.0, 0.0])
         origin = np.array([self.middle, 0.0, 0.0])
         _, _, midline = self.cutter.points(origin, across, lambda e, p: np.ones(len(p), dtype=bool))
@@ -91,7 +95,7 @@ class Subject:
             )
         crotch = float(midline[:, 1].min())
         top = float(self.joint("left_shoulder")[1])
-        at = {name: crotch + share * (top - crotch) for name, share in TRUNK_SHARES.items()}
+        at = {name: crotch + mix(shares, sex) * (top - crotch) for name, shares in TRUNK_SHARES.items()}
         return Levels(crotch=crotch, thigh=crotch - THIGH_BELOW_CROTCH * self.stature, **at)
 
     # What counts as a part. Labels alone will not do: the side of the chest may follow the arm's bone.
@@ -187,9 +191,8 @@ class Subject:
         hand = v[self.on_hand & (v[:, 0] > self.middle)]
         foot = v[self.on_foot & (v[:, 0] > self.middle)]
         foot_length, foot_breadth = _foot_size(foot)
-        skull = v[
-            self.on_head & (v[:, 1] > self.crown - 0.062 * self.stature)
-        ]  # above the ears and the brows
+        above_ears = self.crown - 0.048 * self.stature
+        skull = v[self.on_head & (v[:, 1] > above_ears)]
         return {
             **out,
             "biacromial": float(joint("left_shoulder")[0] - joint("right_shoulder")[0]) + 2 * inset,
@@ -235,11 +238,12 @@ def measures_of(
 ) -> dict[str, float]:
     """All that a tape reads on a body in the T-pose: metres, but for `litres`, `kilograms` and `bmi`.
 
-    `parts` is the bone (0 to 23) that moves each vertex most. `sex` (0 female to 1 male) only enters the
-    density that turns litres into kilograms. Girths come first, in the order of `anthropometry.GIRTHS`.
-    Raises ValueError where the body has no section at a level: it is not in the T-pose, or not a body.
+    `parts` is the bone (0 to 23) that moves each vertex most. `sex` (0 female to 1 male) enters the
+    density that turns litres into kilograms, and the level of the chest. Girths come first, in the order
+    of `anthropometry.GIRTHS`. Raises ValueError where the body has no section at a level: it is not in
+    the T-pose, or not a body.
     """
-    subject = Subject(template, faces, joints, parts)
+    subject = Subject(template, faces, joints, parts, sex=sex)
     lines = subject.girth_lines()
     litres = 1000 * volume_m3(template, faces)
     kilograms = weight_kg(litres, subject.stature, sex)
