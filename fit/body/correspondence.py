@@ -14,7 +14,7 @@ from .remesh import SEAM_TOLERANCE_M
 OFF_SEAM_M = 6e-4
 SOFTNESS_M = 0.015  # how fast the say of a farther primitive fades
 FARTHEST_M = 0.06
-OFF_SKIN_M = 1.5e-3
+OFF_SKIN_M = 1e-3
 MARGIN_M = 0.05  # a primitive shapes the vertices so near it on the template; on others it may be larger
 
 
