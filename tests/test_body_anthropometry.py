@@ -68,9 +68,8 @@ def test_a_given_bmi_is_met_and_weight_follows() -> None:
 @pytest.mark.parametrize("bmi", [17.0, 25.0, 36.0])
 def test_a_tape_around_the_mesh_reads_what_was_asked(sex: float, bmi: float) -> None:
     parts = load_or_build("neutral", show_progress=False).parts
-    from fit.body.build import _shared_half_mesh, cache_folder
 
-    half, faces = _shared_half_mesh(cache_folder(), lambda *_: None)
+    half, faces = half_mesh.load_half_mesh()
     source, _ = make_person(measure(0.5))
     person = measure(sex, bmi=bmi)
     body, joints = make_person(person)

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from fit.body import half_mesh
 from fit.body.anatomy import make_person
 from fit.body.anthropometry import Measurements, measure, n_scores
-from fit.body.build import _shared_half_mesh, cache_folder, load_or_build
+from fit.body.build import load_or_build
 from fit.body.correspondence import Carrier
 from fit.body.foot import foot_of
 from fit.body.hand import hand_of
@@ -29,7 +29,7 @@ PEOPLE = [(0.0, 17.0), (0.0, 25.0), (0.0, 40.0), (1.0, 18.0), (1.0, 26.0), (1.0,
 @pytest.fixture(scope="module")
 def half() -> Mesh:
     load_or_build("neutral", show_progress=False)
-    return _shared_half_mesh(cache_folder(), lambda *_: None)
+    return half_mesh.load_half_mesh()
 
 
 @pytest.fixture(scope="module")

@@ -131,11 +131,10 @@ def test_the_three_sexes_share_one_mesh_and_differ() -> None:
 
 
 def test_building_is_deterministic() -> None:
-    from fit.body.build import _shared_half_mesh, build, cache_folder
+    from fit.body.build import build
+    from fit.body.half_mesh import load_half_mesh
 
-    load_body("free:neutral", show_progress=False)
-    half, faces = _shared_half_mesh(cache_folder(), lambda *_: None)
-    first, second = (build(half, faces, "female", n_people=130) for _ in range(2))
+    first, second = (build(*load_half_mesh(), "female", n_people=130) for _ in range(2))
     assert first.content_hash == second.content_hash
 
 
@@ -150,7 +149,6 @@ def test_a_damaged_cache_is_built_anew(tmp_path: Path, monkeypatch: pytest.Monke
         return wanted
 
     monkeypatch.setattr(build_module, "build", quick)
-    monkeypatch.setattr(build_module, "_shared_half_mesh", lambda *_: (None, None))
     (tmp_path / "neutral.npz").write_bytes(b"half a file")
     build_module.load_or_build("neutral", show_progress=False, folder=tmp_path)
     assert len(calls) == 1

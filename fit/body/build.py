@@ -1,12 +1,11 @@
 """The free body from beginning to end, built once and kept in the user's cache.
 
-Half mesh -> people drawn and brought into correspondence -> shape space -> joint regressor, weights,
-correctives. Deterministic: the same sources give the same arrays. The three sexes share one mesh. Licence of
-the result: CC0.
+Half mesh (shipped, the same everywhere) -> people drawn and brought into correspondence -> shape space ->
+joint regressor, weights, correctives. Deterministic: the same sources give the same arrays. The three sexes
+share one mesh. Licence of the result: CC0.
 """
 
 import hashlib
-import zipfile
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
@@ -44,7 +43,7 @@ LICENCE = "CC0-1.0"
 GENERATOR = (
     "anatomy.py", "ansur2.json", "anthropometry.py", "bends.py", "build.py", "correctives.py",
     "correspondence.py", "density.py", "dual_quaternions.py", "flesh.py", "foot.py", "girth_solver.py",
-    "half_mesh.py", "hand.py", "head.py", "implicit.py", "implicit_relief.py", "implicit_tape.py",
+    "half_mesh.npz", "half_mesh.py", "hand.py", "head.py", "implicit.py", "implicit_relief.py", "implicit_tape.py",
     "joint_regressor.py", "limbs.py", "local_variation.py", "parts.py", "plan.py", "pose_prior.py",
     "ramp.py", "remesh.py", "sections.py", "shape_space.py", "skeleton.py", "skin_weights.py",
     "smooth_variation.py", "stations.py", "tape.py", "trunk.py",
@@ -77,38 +76,15 @@ def load_or_build(sex_name: str, *, show_progress: bool = True, folder: Path | N
             return BodyModel.load(path)
         except BodyModelError:
             pass  # a damaged cache is no reason to stop: it is written anew below
-    n_steps = half_mesh.N_ROUNDS + N_PEOPLE + 4
+    n_steps = N_PEOPLE + 4
     with tqdm(total=n_steps, desc=f"building the {sex_name} body", disable=not show_progress) as bar:
-        half, faces = _shared_half_mesh(folder, bar.update)
-        model = build(half, faces, sex_name, bar.update)
+        model = build(*half_mesh.load_half_mesh(), sex_name, bar.update)
     try:
         model.save(path)
     except OSError as error:
         if show_progress:
             tqdm.write(f"The body could not be kept in {folder} ({error}); it will be built again next time.")
     return model
-
-
-def _shared_half_mesh(
-    folder: Path, progress: Callable[..., object]
-) -> tuple[Float[np.ndarray, "h 3"], Int[np.ndarray, "g 3"]]:
-    """The half mesh that all sexes share, from the cache where it is."""
-    path = folder / "half-mesh.npz"
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            half, faces = stored["half"], stored["faces"]
-        progress(half_mesh.N_ROUNDS)
-        return half, faces
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        half, faces = half_mesh.make_half_mesh(progress)
-    temporary = path.with_suffix(f".{np.random.default_rng().integers(1 << 40):x}.npz")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        np.savez(temporary, half=half, faces=faces)
-        temporary.replace(path)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-    return half, faces
 
 
 def build(

@@ -6,6 +6,8 @@ face.
 
 import itertools
 from collections.abc import Callable, Iterable, Sequence
+from importlib import resources
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -25,6 +27,7 @@ from .remesh import OFF_SEAM_M, SEAM_TOLERANCE_M, Remesher
 from .skeleton import JOINT
 
 N_VERTICES = 6890
+DECIMALS = 7  # of the shipped mesh: a tenth of a micrometre
 # Edge lengths by place; the body's is the price of the face's.
 TRUNK_EDGE_M, PALM_EDGE_M, FINGER_EDGE_M, TIP_EDGE_M = 0.0252, 0.0110, 0.0073, 0.0060
 HEEL_EDGE_M, TOE_EDGE_M = 0.0165, 0.0068
@@ -241,6 +244,22 @@ def make_half_mesh(
 
 
 N_ROUNDS = 10
+STORED = "half_mesh.npz"
+
+
+def load_half_mesh() -> tuple[Float[np.ndarray, "h 3"], Int[np.ndarray, "g 3"]]:
+    """The half mesh as shipped: what `make_half_mesh` gave, so that every machine numbers vertices alike and
+    none has to remesh. `python -m fit.body.half_mesh` writes it anew after the anatomy has changed."""
+    with resources.files(__package__).joinpath(STORED).open("rb") as stream:
+        stored = np.load(stream, allow_pickle=False)
+        return stored["vertices"], stored["faces"].astype(np.int64)
+
+
+def write_half_mesh() -> None:
+    """Remesh the average body and keep the result beside this file."""
+    vertices, faces = make_half_mesh()
+    path = Path(__file__).with_name(STORED)
+    np.savez_compressed(path, vertices=np.round(vertices, DECIMALS), faces=faces.astype(np.uint16))
 
 
 def mirror(
@@ -255,3 +274,7 @@ def mirror(
     whole[:n][seam, 0] = 0
     faces = np.concatenate([f, partner[f][:, ::-1]])
     return whole, faces, np.concatenate([partner, np.flatnonzero(~seam)])
+
+
+if __name__ == "__main__":
+    write_half_mesh()
