@@ -36,14 +36,15 @@ from .smooth_variation import smooth_components
 SEX_COORDINATE: dict[str, float | None] = {"neutral": None, "female": 0.0, "male": 1.0}
 N_COMPONENTS = 160
 """Of the shape space: people's principal components, then named local ones, then smooth ones."""
-N_PEOPLE = 500
+N_PEOPLE = 360
 N_PEOPLE_FOR_JOINTS = 120
 DECIMALS = 9  # of the stored arrays: a nanometre, so that a last bit of some BLAS does not change the hash
 LICENCE = "CC0-1.0"
 GENERATOR = (
     "anatomy.py", "ansur2.json", "anthropometry.py", "bends.py", "build.py", "correctives.py",
     "correspondence.py", "density.py", "dual_quaternions.py", "flesh.py", "foot.py", "girth_solver.py",
-    "half_mesh.npz", "half_mesh.py", "hand.py", "head.py", "implicit.py", "implicit_relief.py", "implicit_tape.py",
+    "half_mesh.npz", "half_mesh.py", "hand.py", "head.py", "implicit.py", "implicit_relief.py",
+    "implicit_tape.py",
     "joint_regressor.py", "limbs.py", "local_variation.py", "parts.py", "plan.py", "pose_prior.py",
     "ramp.py", "remesh.py", "sections.py", "shape_space.py", "skeleton.py", "skin_weights.py",
     "smooth_variation.py", "stations.py", "tape.py", "trunk.py",
