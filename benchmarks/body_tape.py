@@ -21,10 +21,10 @@ from jaxtyping import Float
 from benchmarks.hull import machine
 from fit.body.anatomy import make_person
 from fit.body.anthropometry import GIRTHS, Measurements, draw_people, measure
-from fit.body.build import _shared_half_mesh, cache_folder, load_or_build
+from fit.body.build import load_or_build
 from fit.body.correspondence import Carrier
 from fit.body.density import weight_kg
-from fit.body.half_mesh import mirror
+from fit.body.half_mesh import load_half_mesh, mirror
 from fit.body.model import BodyModel
 from fit.body.sections import volume_m3
 from fit.body.tape import Levels, Subject
@@ -83,14 +83,12 @@ def table(title: str, errors: Float[np.ndarray, "n m"]) -> None:
         print(f"| {name} | {e.mean():.1f} | {rms:.1f} | {low:.1f} | {high:.1f} | {np.abs(e).max():.1f} |")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Measures of the free body, asked and read.")
-    parser.add_argument("--people", type=int, default=200, help="of each sex")
-    n = parser.parse_args().people
-    print(f"{n} people of each sex\n{machine()}")
+def print_measures(n: int) -> None:
+    """The tables for n people of each sex."""
+    print(f"{n} people of each sex")
     for sex_name, sex in SEXES.items():
         model = load_or_build(sex_name, show_progress=False)
-        half, half_faces = _shared_half_mesh(cache_folder(), lambda *_: None)
+        half, half_faces = load_half_mesh()
         carrier = Carrier(half, half_faces, make_person(measure(0.5))[0])
         area = vertex_areas(model.template, model.faces)
         built, linear, seconds = [], [], 0.0
@@ -106,6 +104,14 @@ def main() -> None:
             linear.append(errors_percent(person, near, model.joint_regressor @ near, model))
         table(f"{sex_name}, built ({1000 * seconds / n:.0f} ms of processor time a person)", np.array(built))
         table(f"{sex_name}, linear model with {model.n_anthropometric} components", np.array(linear))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Measures of the free body, asked and read.")
+    parser.add_argument("--people", type=int, default=200, help="of each sex")
+    n = parser.parse_args().people
+    print(machine())
+    print_measures(n)
 
 
 if __name__ == "__main__":
