@@ -34,7 +34,7 @@ from .skin_weights import make_skin_weights
 from .smooth_variation import smooth_components
 
 SEX_COORDINATE: dict[str, float | None] = {"neutral": None, "female": 0.0, "male": 1.0}
-N_COMPONENTS = 160
+N_COMPONENTS = 176
 """Of the shape space: people's principal components, then named local ones, then smooth ones."""
 N_PEOPLE = 360
 N_PEOPLE_FOR_JOINTS = 120

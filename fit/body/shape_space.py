@@ -15,7 +15,7 @@ from .anthropometry import draw_people, measure
 from .correspondence import Carrier
 from .skeleton import JOINT
 
-N_ANTHROPOMETRIC = 16
+N_ANTHROPOMETRIC = 32
 
 
 @dataclass(frozen=True)
