@@ -32,7 +32,7 @@ class BodyConvert:
 
     file: FileArgument
     """An .npz or .pkl of SMPL, SMPL-H or SMPL-X; or free:neutral, free:female, free:male; or anny,
-    anny:FOLDER (made into SMPL's structure)."""
+    anny:FOLDER, mhr, mhr:FOLDER (made into SMPL's structure)."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT.npz")]
     """File to write."""
     overwrite: bool = False
@@ -85,10 +85,15 @@ def opened(spec: str) -> tuple[BodyFile, BodyModel]:
     if spec.startswith("free:"):
         model = load_body(spec)
         return model.as_file(), model
-    if spec == "anny" or spec.startswith("anny:"):
+    name, _, assets = spec.partition(":")
+    if name == "anny":
         from fit.body.anny import anny_body_file
 
-        file = anny_body_file(Path(spec.removeprefix("anny:")) if ":" in spec else None)
+        file = anny_body_file(Path(assets) if assets else None)
+    elif name == "mhr":
+        from fit.body.mhr import mhr_body_file
+
+        file = mhr_body_file(Path(assets) if assets else None)
     else:
         file = read_body_file(spec)
     return file, BodyModel.of_file(file, spec)
