@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.bodyhull-installed
 export PYOPENGL_PLATFORM ?= egl
 
-.PHONY: help setup demo test lint types check clean
+.PHONY: help setup demo test lint types bodies clean
 
 help:
 	@echo "make demo   set up, film a synthetic clothed person, run the whole pipeline on it, compare with the truth"
@@ -24,8 +24,12 @@ $(STAMP): pyproject.toml scripts/system-libraries.sh
 demo: setup
 	$(BIN)/bodyhull demo --out demo
 
-test: setup lint types
+test: setup lint types bodies
 	$(BIN)/python -m pytest
+
+# Built ahead: inside the tests every call of the generator would be checked, which makes it several times slower.
+bodies: setup
+	for sex in neutral female male; do $(BIN)/bodyhull body info free:$$sex || exit 1; done
 
 lint: setup
 	$(BIN)/ruff check .

@@ -1,5 +1,6 @@
 """The free body keeps its promises, and body files round-trip or say what is wrong with them."""
 
+import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,19 @@ from fit.body import BodyModel, BodyModelError, load_body
 from fit.body.parts import BODY_25, REGIONS, region_mask, region_of_vertices
 from fit.body.skeleton import JOINT, MIRROR, PARENTS
 from fit.body.tape import volume_m3
+
+
+def signature(body: BodyModel) -> tuple[float, ...]:
+    """One number an array: its product with a fixed wave, which any change of an entry changes."""
+    arrays = (body.template, body.shape_directions, body.pose_directions, body.weights, body.joint_regressor)
+    return tuple(float(a.ravel() @ np.sin(0.7 * np.arange(a.size) + 0.3)) for a in arrays)
+
+
+SIGNATURES: dict[str, tuple[float, ...]] = {
+    "neutral": (-1.30465, -0.68042, -1.05044, -49.74021, 0.72685),
+    "female": (-1.48478, -0.35163, -0.61638, -48.67179, 1.15953),
+    "male": (-1.13101, 0.17808, -0.84578, -50.59811, 0.45248),
+}
 
 
 @pytest.fixture(scope="module", params=["neutral", "female", "male"])
@@ -128,6 +142,25 @@ def test_the_three_sexes_share_one_mesh_and_differ() -> None:
     assert all((b.faces == bodies[0].faces).all() for b in bodies)
     assert len({b.content_hash for b in bodies}) == 3
     assert len({b.name for b in bodies}) == 3
+
+
+def test_the_shipped_mesh_is_the_one_that_is_known_and_lies_on_the_average_body() -> None:
+    """A changed anatomy needs `python -m fit.body.half_mesh`; a changed numbering breaks saved fits."""
+    from fit.body.anatomy import make_person
+    from fit.body.anthropometry import measure
+    from fit.body.half_mesh import load_half_mesh
+
+    vertices, faces = load_half_mesh()
+    digest = hashlib.sha256(vertices.tobytes() + faces.tobytes()).hexdigest()
+    assert digest[:16] == "9450ed01aff91752"
+    assert np.abs(make_person(measure(0.5))[0](vertices)).max() < 1e-4
+
+
+@pytest.mark.parametrize(("sex", "known"), SIGNATURES.items())
+def test_the_built_bodies_are_the_ones_that_are_known(sex: str, known: tuple[float, ...]) -> None:
+    """Every array against the one this version was released with, up to the last bits of a linear algebra
+    library (a hash of all bits would tell processors apart)."""
+    np.testing.assert_allclose(signature(load_body(f"free:{sex}", show_progress=False)), known, atol=2e-4)
 
 
 def test_building_is_deterministic() -> None:

@@ -24,9 +24,8 @@ def girth_lines(model: BodyModel) -> dict[str, GirthLine]:
 def measure_body(model: BodyModel, betas: Float[np.ndarray, "b"]) -> dict[str, float]:
     """What a tape reads on this shape in the T-pose (see `tape.measures_of`): metres, litres, kilograms.
 
-    The sex that the density needs is taken from the model's name ("female", "male", else midway).
+    The sex that the density needs is the model's gender; midway where that is neutral or unknown.
     """
     template = model.shaped(betas)
-    name = model.name.lower()
-    sex = 0.0 if "female" in name else 1.0 if "male" in name else 0.5
+    sex = {"female": 0.0, "male": 1.0}.get(model.gender, 0.5)
     return measures_of(template, model.faces, model.joint_regressor @ template, model.parts, sex)
