@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import tyro
 
 from bodyhull.errors import OK, UserError
@@ -149,8 +150,10 @@ def convert(command: BodyConvert) -> None:
         raise UserError(f"{command.out}: a body is written as .npz; give a name that ends so")
     if command.out.exists() and not command.overwrite:
         raise UserError(f"{command.out}: is there already; --overwrite replaces it")
+    from fit.body.marks import marks_of
+
     file, model = opened(command.file)
-    file.save(command.out)
+    file.save(command.out, hash=np.array(model.content_hash), **marks_of(model))
     for note in file.notes:
         print(f"note          {note}")
     print(f"{command.out}: {file.kind}, {len(file.parents)} joints, {file.shape_directions.shape[2]} betas")
