@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from fit.body import BodyModel
-from fit.body.marks import shape_names
 from fit.body.parts import REGIONS, region_mask, region_of_vertices
 from fit.body.skeleton import JOINT, axis_angle_to_matrix, blend_linearly, world_from_rest
 from fit.surface import vertex_normals
@@ -102,8 +101,8 @@ def make_subject(
         raise SubjectError(f"no outfit is called {garment!r}; there are: {', '.join(OUTFITS)}")
     rng = np.random.default_rng([seed, 3])
     drawn = np.zeros(body.n_betas)
-    n = n_drawn(body)
-    drawn[:n] = np.clip(rng.standard_normal(n), -2.0, 2.0)
+    n_measured = body.n_anthropometric
+    drawn[:n_measured] = np.clip(rng.standard_normal(n_measured), -2.0, 2.0)
     if betas is not None:
         drawn = np.zeros(body.n_betas)
         drawn[: len(betas)] = betas
@@ -140,12 +139,6 @@ def make_subject(
         covered,
         _skin_colours(body, template, landmarks, rng),
     )
-
-
-def n_drawn(body: BodyModel) -> int:
-    """How many of the first shape coefficients make a person: measures and named places, where the body has
-    them; the smooth ones are the fit's own."""
-    return body.n_betas - sum(name.startswith("smooth") for name in shape_names(body))
 
 
 def _eligible_parts(body: BodyModel) -> dict[int, np.ndarray]:
