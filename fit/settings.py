@@ -74,7 +74,7 @@ class FitSettings:
     track_pose: StageWeights = field(default_factory=_track_pose)
     track_template: StageWeights = field(default_factory=_track_template)
     #: lambda_fit is multiplied by (spread_m / spread)^spread_power a vertex, within these limits.
-    spread_m: float = 0.0023
+    spread_m: float = 0.0025
     spread_power: float = 3.0
     spread_rounds: int = 15
     fit_scale_limits: tuple[float, float] = (0.01, 20.0)
