@@ -127,12 +127,10 @@ def info_text(file: BodyFile, model: BodyModel) -> str:
 def measured(model: BodyModel) -> list[tuple[str, str]]:
     """Height, volume, weight and girths of the mean shape; a sentence instead where it cannot be measured."""
     from fit.body.anthropometry import GIRTHS
-    from fit.body.tape import measures_of
+    from fit.body.girth_lines import measure_body
 
-    sex = {"female": 0.0, "male": 1.0}.get(model.gender, 0.5)
-    joints = model.joint_regressor @ model.template
     try:
-        found = measures_of(model.template, model.faces, joints, model.parts, sex)
+        found = measure_body(model, np.zeros(model.n_betas))
     except ValueError as error:
         return [("measures", f"none: {error}")]
     girths = [f"{name} {100 * found[name]:.1f}" for name in GIRTHS]

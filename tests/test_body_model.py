@@ -1,5 +1,6 @@
 """The free body keeps its promises, and body files round-trip or say what is wrong with them."""
 
+import ast
 import hashlib
 from pathlib import Path
 
@@ -161,6 +162,29 @@ def test_the_built_bodies_are_the_ones_that_are_known(sex: str, known: tuple[flo
     """Every array against the one this version was released with, up to the last bits of a linear algebra
     library (a hash of all bits would tell processors apart)."""
     np.testing.assert_allclose(signature(load_body(f"free:{sex}", show_progress=False)), known, atol=2e-4)
+
+
+def test_the_cache_key_covers_every_source_that_the_build_imports() -> None:
+    """A source left out would leave an old body in the cache after it has changed."""
+    from fit.body import build as build_module
+
+    reading = {"model.py"}  # a body's file is read and written by these, not shaped
+    folder = Path(build_module.__file__).parent
+    seen, waiting = set(), {"build.py"}
+    while waiting:
+        name = waiting.pop()
+        seen.add(name)
+        for node in ast.walk(ast.parse((folder / name).read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.ImportFrom):
+                continue
+            if node.level == 1:
+                modules = [node.module] if node.module else [alias.name for alias in node.names]
+            elif node.module and node.module.startswith("fit.") and not node.module.startswith("fit.body"):
+                modules = [f"../{node.module.removeprefix('fit.')}"]
+            else:
+                continue
+            waiting |= {f"{module}.py" for module in modules} - seen - reading
+    assert seen <= set(build_module.GENERATOR), f"not in the key: {seen - set(build_module.GENERATOR)}"
 
 
 def test_building_is_deterministic() -> None:

@@ -1,5 +1,7 @@
 """The shape space beyond measured people: named places move where their names say, the rest is smooth."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -136,7 +138,7 @@ def test_bare_skin_is_hands_and_face(body: BodyModel) -> None:
     np.testing.assert_array_equal(bare, bare[partner_of(body)])
 
 
-def test_a_saved_body_carries_its_marks(body: BodyModel, tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_a_saved_body_carries_its_marks(body: BodyModel, tmp_path: Path) -> None:
     body.save(tmp_path / "body.npz")
     with np.load(tmp_path / "body.npz", allow_pickle=False) as stored:
         for key, array in marks_of(body).items():

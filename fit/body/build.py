@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 from platformdirs import user_cache_path
+from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from fit.surface import vertex_areas
@@ -36,6 +37,9 @@ from .smooth_variation import smooth_components
 SEX_COORDINATE: dict[str, float | None] = {"neutral": None, "female": 0.0, "male": 1.0}
 N_COMPONENTS = 176
 """Of the shape space: people's principal components, then named local ones, then smooth ones."""
+AMPLITUDE = {"torso": 1.1, "leg": 0.95, "arm": 1.0, "neck": 1.0}
+"""Standard deviation of smooth variation by region, relative; elsewhere OTHER_AMPLITUDE."""
+OTHER_AMPLITUDE = 0.6
 N_PEOPLE = 360
 N_PEOPLE_FOR_JOINTS = 120
 DECIMALS = 9  # of the stored arrays: a nanometre, so that a last bit of some BLAS does not change the hash
@@ -44,10 +48,9 @@ GENERATOR = (
     "anatomy.py", "ansur2.json", "anthropometry.py", "bends.py", "build.py", "correctives.py",
     "correspondence.py", "density.py", "dual_quaternions.py", "flesh.py", "foot.py", "girth_solver.py",
     "half_mesh.npz", "half_mesh.py", "hand.py", "head.py", "implicit.py", "implicit_relief.py",
-    "implicit_tape.py",
-    "joint_regressor.py", "limbs.py", "local_variation.py", "parts.py", "plan.py", "pose_prior.py",
-    "ramp.py", "remesh.py", "sections.py", "shape_space.py", "skeleton.py", "skin_weights.py",
-    "smooth_variation.py", "stations.py", "tape.py", "trunk.py",
+    "implicit_tape.py", "joint_regressor.py", "limbs.py", "local_variation.py", "parts.py", "plan.py",
+    "pose_prior.py", "ramp.py", "remesh.py", "sections.py", "shape_space.py", "skeleton.py",
+    "skin_weights.py", "smooth_variation.py", "stations.py", "tape.py", "trunk.py", "../surface.py",
 )  # fmt: skip
 
 
@@ -78,7 +81,10 @@ def load_or_build(sex_name: str, *, show_progress: bool = True, folder: Path | N
         except BodyModelError:
             pass  # a damaged cache is no reason to stop: it is written anew below
     n_steps = N_PEOPLE + 4
-    with tqdm(total=n_steps, desc=f"building the {sex_name} body", disable=not show_progress) as bar:
+    with (
+        threadpool_limits(limits=1, user_api="blas"),  # the order of sums, and so the hash, hangs on threads
+        tqdm(total=n_steps, desc=f"building the {sex_name} body", disable=not show_progress) as bar,
+    ):
         model = build(*half_mesh.load_half_mesh(), sex_name, bar.update)
     try:
         model.save(path)
@@ -154,11 +160,6 @@ def _held(
     above = smooth_step(-0.02, 0.03, template[:, 1] - joints[JOINT["head"], 1])
     jaw = smooth_step(0.02, 0.04, template[:, 2])
     return np.maximum(held, head * np.maximum(above, jaw))
-
-
-AMPLITUDE = {"torso": 1.1, "leg": 0.95, "arm": 1.0, "neck": 1.0}
-"""Standard deviation of smooth variation by region, relative; elsewhere OTHER_AMPLITUDE."""
-OTHER_AMPLITUDE = 0.6
 
 
 def _smooth_amplitude(parts: Int[np.ndarray, "v"]) -> Float[np.ndarray, "v"]:
