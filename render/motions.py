@@ -15,7 +15,9 @@ from jaxtyping import Float
 
 from fit.body.skeleton import JOINT, N_JOINTS, PARENTS, axis_angle_to_matrix
 
-Joints = dict[str, tuple[float, float, float]]
+from .limb_angles import STANDING, Turn, ankle_lift, standing_leg, turned_arm
+
+Joints = dict[str, Turn]
 """Axis-angle of some joints (rad, body frame: x the body's left, y up, z front); all others stay at rest."""
 
 
@@ -51,6 +53,25 @@ def _arms(down: float, elbow: float = 0.25) -> Joints:
     }
 
 
+def _both_arms(shoulder: Turn, axial: float, elbow: float, pronation: float = 0.0) -> Joints:
+    """`turned_arm` on both sides."""
+    return {
+        **turned_arm("left", shoulder, axial, elbow, pronation),
+        **turned_arm("right", shoulder, axial, elbow, pronation),
+    }
+
+
+def _planted(pelvis: Turn, place: Turn, *, apart: float, knee_out: float) -> Joints:
+    """The pelvis turned and moved to `place` (thighs, from where it is in a person who stands straight) over
+    two feet that stay flat where they are, `apart` farther from the middle than at rest.
+    """
+    joints: Joints = {"pelvis": pelvis}
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        foot = STANDING * (sign, 1.0, 1.0) + (sign * apart, 0.0, 0.0)
+        joints |= standing_leg(side, pelvis, foot - np.array(place), knee_out=knee_out)
+    return joints
+
+
 def _wave(phase: float) -> float:
     """0 -> 1 -> 0 over a period, at rest at the ends."""
     return 0.5 - 0.5 * np.cos(2 * np.pi * phase)
@@ -75,34 +96,35 @@ def _tilt_twist(phase: float, size: float) -> _Moment:
         {
             **trunk,
             **_arms(0.75 - 0.25 * lean, 0.35),
-            **_both("hip", -0.18 * lean, 0.0, 0.1),
-            "pelvis": (0.12 * lean, 0.15 * turn, 0.0),
+            # the pelvis goes back a little as the trunk goes forward
+            **_planted(
+                (0.12 * lean, 0.15 * turn, 0.0),
+                (0.0, -0.025 - 0.01 * lean, -0.12 * lean),
+                apart=0.19,
+                knee_out=0.05,
+            ),
             "neck": (-0.1 * lean, 0.12 * turn, 0.0),
             "head": (-0.1 * lean, 0.15 * turn, 0.0),
-            **_both("knee", 0.12 * lean, 0.0, 0.0),
-            **_both("ankle", -0.06 * lean, 0.0, -0.1),
         }
     )
 
 
 def _hips(phase: float, size: float) -> _Moment:
-    """The pelvis circles over standing feet; the trunk and the legs turn against it."""
-    tip, roll = 0.2 * size * np.cos(2 * np.pi * phase), 0.2 * size * np.sin(2 * np.pi * phase)
+    """The pelvis circles over standing feet, hands on the hips; the trunk stays upright above it."""
+    ahead, aside = np.cos(2 * np.pi * phase), np.sin(2 * np.pi * phase)
+    # tipped back where it is in front, the hip that it goes to is the higher one
+    tip, roll = -0.17 * size * ahead, 0.17 * size * aside
     spine = {f"spine{i}": (-0.36 * tip, 0.0, -0.36 * roll) for i in (1, 2, 3)}
-    bend = 0.28 + 0.08 * np.cos(2 * np.pi * phase)
+    place = (0.15 * size * aside, -0.1, 0.15 * size * ahead)
     return _Moment(
         {
-            "pelvis": (tip, 0.12 * roll, roll),
+            **_planted((tip, 0.12 * roll, roll), place, apart=0.26, knee_out=0.15),
             **spine,
-            "left_hip": (-tip - 0.5 * bend, 0.15, -1.35 * roll + 0.16),
-            "right_hip": (-tip - 0.5 * bend, -0.15, -1.35 * roll - 0.16),
-            **_both("knee", bend, 0.0, 0.0),
-            "left_ankle": (-0.5 * bend, 0.0, 0.35 * roll - 0.16),
-            "right_ankle": (-0.5 * bend, 0.0, 0.35 * roll + 0.16),
-            # hands on the hips
             **_both("collar", 0.0, 0.0, -0.05),
-            **_both("shoulder", 0.55, 0.35, -0.85),
-            **_both("elbow", 0.0, -1.35, 0.35),
+            # each arm makes way for the hip that comes to it
+            **turned_arm("left", (0.0, 0.2, -0.55 + 0.45 * roll), axial=1.32, elbow=1.54, pronation=-0.37),
+            **turned_arm("right", (0.0, 0.2, -0.55 - 0.45 * roll), axial=1.32, elbow=1.54, pronation=-0.37),
+            **_both("wrist", -0.38, -0.56, 0.57),
         }
     )
 
@@ -121,24 +143,38 @@ def _shoulders_mill(phase: float, size: float) -> _Moment:
     return _Moment(joints)
 
 
+def _pulse(phase: float, at: float) -> float:
+    """1 at a moment of the period, 0 a quarter of it away."""
+    return float(np.exp(6.0 * (np.cos(2 * np.pi * (phase - at)) - 1.0)))
+
+
 def _walk(phase: float, size: float) -> _Moment:
-    """One double step forward."""
+    """One double step forward: heels strike, feet roll over their balls, knees bend while a leg swings."""
+    turn = 0.1 * size * np.cos(2 * np.pi * phase)
+    pelvis = (0.03, -turn, 0.0)
+    height = -0.02 - 0.05 * size * (1.0 + np.cos(4 * np.pi * phase))  # lowest with both feet on the ground
     joints: Joints = {}
     for side, sign, shift in (("left", 1.0, 0.0), ("right", -1.0, 0.5)):
-        angle = 2 * np.pi * (phase + shift)
-        forward = np.cos(angle)  # +1: this leg is in front
-        swinging = max(0.0, -np.sin(angle))  # coming forward through the air
-        joints[f"{side}_hip"] = (-0.42 * size * forward - 0.25 * swinging + 0.04, 0.0, 0.02 * sign)
-        knee = 0.10 + 0.16 * max(0.0, np.sin(angle)) + 0.95 * size * swinging**1.5
-        joints[f"{side}_knee"] = (knee, 0.0, 0.0)
-        joints[f"{side}_ankle"] = (0.16 * forward - 0.12 + 0.1 * swinging, 0.0, -0.02 * sign)
-        joints[f"{side}_foot"] = (-0.28 * max(0.0, -forward) * max(0.0, np.sin(angle) + 0.5), 0.0, 0.0)
+        own = phase + shift
+        forward = np.cos(2 * np.pi * own)  # +1: this leg is in front
+        toes_down = size * (0.6 * _pulse(own, 0.55) - 0.24 * _pulse(own, -0.02))
+        swing_height = 0.12 * max(0.0, -np.sin(2 * np.pi * own)) ** 2
+        foot = STANDING * (sign, 1.0, 1.0) + (
+            -0.12 * sign,
+            ankle_lift(toes_down) + swing_height - height,
+            0.7 * size * forward,
+        )
+        joints |= standing_leg(side, pelvis, foot, knee_out=0.06, toes_down=toes_down)
+        joints[f"{side}_foot"] = (
+            -0.8 * max(0.0, toes_down) ** 1.5,
+            0.0,
+            0.0,
+        )  # toes stay down as a heel lifts
         swing = -forward  # arms against the legs
         joints[f"{side}_collar"] = (0.0, -0.06 * sign * swing, -0.1 * sign)
         joints[f"{side}_shoulder"] = (-0.48 * size * swing, -0.12 * sign, -1.12 * sign)
-        joints[f"{side}_elbow"] = (0.0, -sign * (0.35 + 0.25 * max(0.0, swing)), 0.0)
-    turn = 0.1 * size * np.cos(2 * np.pi * phase)
-    joints |= {"pelvis": (0.03, -turn, 0.0), "spine1": (0.02, 0.5 * turn, 0.0), "spine2": (0.02, turn, 0.0)}
+        joints[f"{side}_elbow"] = (0.0, -sign * (0.35 + 0.12 * (1.0 + swing)), 0.0)
+    joints |= {"pelvis": pelvis, "spine1": (0.02, 0.5 * turn, 0.0), "spine2": (0.02, turn, 0.0)}
     joints |= {"spine3": (0.0, 0.5 * turn, 0.0), "head": (0.0, -0.5 * turn, 0.0)}
     # the weight passes from foot to foot where both are on the ground
     left = float(np.clip(0.5 + 2.5 * np.sin(2 * np.pi * phase), 0.0, 1.0))
@@ -188,14 +224,13 @@ def _lunge(phase: float, size: float) -> _Moment:
 
 
 def _a_t_u(phase: float, size: float) -> _Moment:
-    """Arms from an A over a T to a U, one slow raise."""
+    """Arms from an A over a T to a U, one slow raise; on the way they turn, until palms face front."""
     up = _ease(phase)
-    lift = -0.95 + up * (1.75 * min(size, 1.1))
+    lift = -0.95 + up * (1.95 * min(size, 1.1))
     return _Moment(
         {
             **_both("collar", 0.0, 0.0, 0.18 * lift + 0.05 * up),
-            **_both("shoulder", 0.0, 0.0, 0.82 * lift),
-            **_both("elbow", 0.0, -0.25 * (1 - up), 0.9 * up**3),
+            **_both_arms((0.0, 0.0, 0.82 * lift), axial=-0.8 * up, elbow=0.25 + 0.4 * up**3),
             **_both("hip", 0.0, 0.0, 0.1),
             **_both("ankle", 0.0, 0.0, -0.1),
         }
