@@ -21,6 +21,9 @@ from hull.witnesses import WORD_BITS, WitnessRule
 # nothing.
 COARSEST_LEVEL = 5
 
+# How often the space searched for a person is halved at once.
+_FIRST_HALVINGS = 3
+
 _CHILDREN = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.int32).T
 
 
@@ -78,25 +81,28 @@ class Blocks:
 class _Front:
     """The cells still in question at one level, and what is known of them. Columns are cells.
 
-    Sets of cameras, as bits: `unasked` may still decide, `inside` see all of the cell inside, `hopeful` may
-    see some of it inside (so they hold the `inside` ones).
+    Sets of cameras, as bits: `unasked` may still decide, `without` see no part of the cell inside. What is in
+    neither sees all of it inside.
     """
 
     cells: Int[np.ndarray, "3 n"]
     unasked: UInt64[np.ndarray, "w n"]
-    inside: UInt64[np.ndarray, "w n"]
-    hopeful: UInt64[np.ndarray, "w n"]
+    without: UInt64[np.ndarray, "w n"]
     n_outside: np.ndarray
 
     def kept(self, keep: np.ndarray) -> _Front:
-        sets = (self.unasked[:, keep], self.inside[:, keep], self.hopeful[:, keep])
-        return _Front(self.cells[:, keep], *sets, self.n_outside[keep])
+        return _Front(self.cells[:, keep], self.unasked[:, keep], self.without[:, keep], self.n_outside[keep])
 
-    def children(self) -> _Front:
-        cells = (2 * self.cells[:, :, None] + _CHILDREN[:, None, :]).reshape(3, -1)
-        known = (self.unasked, self.inside, self.hopeful, self.n_outside)
-        repeat = [np.repeat(a, 8, axis=-1) for a in known]
-        return _Front(cells.astype(np.int32), *repeat)
+    def inside(self, rule: WitnessRule) -> UInt64[np.ndarray, "w n"]:
+        return rule.full()[:, None] & ~(self.unasked | self.without)
+
+    def hopeful(self, rule: WitnessRule) -> UInt64[np.ndarray, "w n"]:
+        """Who may see some of the cell inside."""
+        return rule.full()[:, None] & ~self.without
+
+    def halved(self) -> Int[np.ndarray, "3 m"]:
+        """Each cell's eight children, next to each other."""
+        return (2 * self.cells[:, :, None] + _CHILDREN[:, None, :]).reshape(3, -1)
 
 
 def carve(tables: Sequence[SilhouetteTable], rule: WitnessRule, grid: Grid, votes: int = 1) -> Blocks:
@@ -106,24 +112,26 @@ def carve(tables: Sequence[SilhouetteTable], rule: WitnessRule, grid: Grid, vote
     """
     coarsest = min(COARSEST_LEVEL, max(int(np.log2(max(grid.shape))), 0))
     front = _first_front(rule, [-(-n >> coarsest) for n in grid.shape])
+    cells = front.cells
     found: list[np.ndarray] = []
     order = list(range(len(tables)))
-    for level in range(coarsest, -1, -1):
+    for level in range(coarsest, 0, -1):
         side = 1 << level
         # Only voxel centres are asked for in the end, so a cell reaches from its first to its last centre.
         half_m = 0.5 * (side - 1) * grid.voxel_m
-        within = np.asarray((front.cells * side < np.array(grid.shape)[:, None]).all(axis=0))
-        front = _ask(
-            tables, rule, front.kept(within), grid.centres(front.cells[:, within], side), half_m, votes, order
-        )
+        within = np.asarray((cells * side < np.array(grid.shape)[:, None]).all(axis=0))
+        front = _ask(tables, rule, front, cells, within, grid.centres(cells, side), half_m, votes, order)
         decided = np.asarray(~front.unasked.any(axis=0))
-        sure = np.flatnonzero(decided)
-        found.append(front.cells[:, sure[rule.enough(front.inside[:, sure])]])
-        if level:
-            front = front.kept(~decided).children()
-    cells = found[::-1]
-    _cut_at_the_grid(cells, grid)
-    return Blocks(grid, tuple(cells))
+        sure = front.kept(decided)
+        found.append(sure.cells[:, rule.enough(sure.inside(rule))])
+        front = front.kept(~decided)
+        cells = front.halved()
+    within = np.asarray((cells < np.array(grid.shape)[:, None]).all(axis=0))
+    chosen = _ask_voxels(tables, rule, front, within, grid.centres(cells), votes, order)
+    found.append(cells[:, chosen])
+    found = found[::-1]
+    _cut_at_the_grid(found, grid)
+    return Blocks(grid, tuple(found))
 
 
 def possible_witnesses(
@@ -134,20 +142,24 @@ def possible_witnesses(
     Conservative: cells are asked whole, down to the grid's own, and those that stay in question count. So
     everything that `carve` could find at any resolution lies in a cell that is not 0.
     """
-    coarsest = int(np.log2(min(grid.shape)))
+    # From so few cells a side on, some can be decided: larger ones fill whole pictures.
+    coarsest = max(int(np.log2(min(grid.shape))) - _FIRST_HALVINGS, 0)
     front = _first_front(rule, [-(-n >> coarsest) for n in grid.shape])
+    cells = front.cells
     found = np.zeros([-(-n >> coarsest) << coarsest for n in grid.shape], dtype=np.int32)
     order = list(range(len(tables)))
     for level in range(coarsest, -1, -1):
         side = 1 << level
-        centres = grid.centres(front.cells, side)
-        front = _ask(tables, rule, front, centres, 0.5 * side * grid.voxel_m, votes, order)
+        everywhere = np.ones(cells.shape[1], dtype=bool)
+        centres = grid.centres(cells, side)
+        front = _ask(tables, rule, front, cells, everywhere, centres, 0.5 * side * grid.voxel_m, votes, order)
         final = np.full(front.cells.shape[1], level == 0) | ~front.unasked.any(axis=0)
-        count = np.bitwise_count(front.hopeful).sum(axis=0, dtype=np.int32)[final]
+        count = np.bitwise_count(front.hopeful(rule)).sum(axis=0, dtype=np.int32)[final]
         i, j, k = front.cells[:, final]
         nx, ny, nz = (n // side for n in found.shape)
         found.reshape(nx, side, ny, side, nz, side)[i, :, j, :, k, :] = count[:, None, None, None]
-        front = front.kept(~final).children()
+        front = front.kept(~final)
+        cells = front.halved()
     nx, ny, nz = grid.shape
     return found[:nx, :ny, :nz]
 
@@ -159,61 +171,114 @@ def _first_front(rule: WitnessRule, n: Sequence[int]) -> _Front:
         cells,
         np.repeat(full[:, None], cells.shape[1], axis=1),
         np.zeros((len(full), cells.shape[1]), dtype=np.uint64),
-        np.repeat(full[:, None], cells.shape[1], axis=1),
         np.zeros(cells.shape[1], dtype=np.uint8),
     )
+
+
+def _asked(front: _Front, camera: int, alive: Bool[np.ndarray, " m"]) -> Int[np.ndarray, " k"]:
+    """Which of the cells a camera is to be asked about: those alive whose parents (the front) it has not
+    decided. Parents are looked through instead of their eight times as many children."""
+    family = len(alive) // max(front.cells.shape[1], 1)
+    bit = np.uint64(1) << np.uint64(camera % WORD_BITS)
+    parents = np.flatnonzero(front.unasked[camera // WORD_BITS] & bit)
+    chosen = (parents[:, None] * family + np.arange(family)).ravel()
+    return chosen[alive[chosen]]
 
 
 def _ask(
     tables: Sequence[SilhouetteTable],
     rule: WitnessRule,
-    front: _Front,
+    parents: _Front,
+    cells: Int[np.ndarray, "3 n"],
+    alive: Bool[np.ndarray, " n"],
     centres: Float[np.ndarray, "3 n"],
     half_m: float,
     votes: int,
     order: list[int],
 ) -> _Front:
-    """The front without the cells that are now known to be outside.
+    """The front of those cells (the parents' own, or their children) that are not known to be outside.
 
-    Sorts `order`, so that the camera that rejects most is asked first on the next level.
+    `alive` is written into. Sorts `order`, so that the camera that rejects most is asked first on the next
+    level.
     """
-    alive = np.ones(centres.shape[1], dtype=bool)
-    hopeless = False
-    n_rejected = np.zeros(len(tables))
-    n_asked = np.zeros(len(tables))
+    family = cells.shape[1] // max(parents.cells.shape[1], 1)
+    front = _Front(
+        cells.astype(np.int32, copy=False),
+        *(
+            np.repeat(known, family, axis=-1)
+            for known in (parents.unasked, parents.without, parents.n_outside)
+        ),
+    )
+    hopeless = votes > 1
+    rejects = np.zeros(len(tables))
     for camera in order:
         word, bit = camera // WORD_BITS, np.uint64(1) << np.uint64(camera % WORD_BITS)
-        selected = np.flatnonzero(alive & ((front.unasked[word] & bit) != 0))
-        if not len(selected):
+        asked = _asked(parents, camera, alive)
+        if not len(asked):
             continue
-        points = centres[:, selected]
-        answers = (
-            tables[camera].ask_points(points) if half_m == 0 else tables[camera].ask_cells(points, half_m)
-        )
-        outside = selected[answers == OUTSIDE]
+        answers = tables[camera].ask_cells(centres[:, asked], half_m)
+        outside = asked[answers == OUTSIDE]
+        front.unasked[word, asked[answers == INSIDE]] &= ~bit
         if votes == 1:
             alive[outside] = False
         else:
             front.n_outside[outside] += 1
             alive[outside[front.n_outside[outside] >= votes]] = False
             front.unasked[word, outside] &= ~bit
-        inside = selected[answers == INSIDE]
-        front.inside[word, inside] |= bit
-        front.unasked[word, inside] &= ~bit
-        blind = selected[answers == NO_EVIDENCE]
-        front.unasked[word, blind] &= ~bit
-        never = selected[(answers & INSIDE) == 0]
-        front.hopeful[word, never] &= ~bit
-        hopeless = hopeless or len(never) > len(outside)
-        n_asked[camera] = len(selected)
-        n_rejected[camera] = len(outside)
-    rejects = n_rejected / np.maximum(n_asked, 1)
+            front.without[word, outside] |= bit
+        if (answers & NO_EVIDENCE).any():
+            front.unasked[word, asked[answers == NO_EVIDENCE]] &= ~bit
+            never = asked[(answers & INSIDE) == 0]
+            front.without[word, never] |= bit
+            hopeless = hopeless or len(never) > len(outside)
+        rejects[camera] = len(outside) / len(asked)
     order.sort(key=lambda camera: -float(rejects[camera]))
     front = front.kept(alive)
-    if hopeless or votes > 1:
+    if hopeless:
         # Space that too few cameras can still vouch for is given up early, or it would be split to the end.
-        front = front.kept(rule.enough(front.hopeful))
+        front = front.kept(rule.enough(front.hopeful(rule)))
     return front
+
+
+def _ask_voxels(
+    tables: Sequence[SilhouetteTable],
+    rule: WitnessRule,
+    parents: _Front,
+    alive: Bool[np.ndarray, " n"],
+    centres: Float[np.ndarray, "3 n"],
+    votes: int,
+    order: list[int],
+) -> Int[np.ndarray, " k"]:
+    """Which (K,) of the parents' voxels, whose centres are given, belong to the hull. `alive` is written
+    into."""
+    family = len(alive) // max(parents.cells.shape[1], 1)
+    n_outside = np.repeat(parents.n_outside, family)
+    exceptions = []
+    for camera in order:
+        asked = _asked(parents, camera, alive)
+        if not len(asked):
+            continue
+        answers = tables[camera].ask_points(centres[:, asked])
+        outside = asked[answers == OUTSIDE]
+        n_outside[outside] += 1
+        alive[outside[n_outside[outside] >= votes]] = False
+        if votes > 1 or (answers == NO_EVIDENCE).any():
+            exceptions.append((camera, asked[answers != INSIDE]))
+    # Whoever has been asked and has not refused sees a voxel inside, with few exceptions; so whether there
+    # are enough witnesses is a question about the parents.
+    settled = _Front(parents.cells, np.zeros_like(parents.unasked), parents.without, parents.n_outside)
+    inside = settled.inside(rule)
+    alive &= np.repeat(rule.enough(inside), family)
+    odd = np.unique(np.concatenate([voxels for _, voxels in exceptions])) if exceptions else np.zeros(0, int)
+    odd = odd[alive[odd]]
+    if len(odd):
+        sets = inside[:, odd // family]
+        for camera, voxels in exceptions:
+            places = np.searchsorted(odd, voxels)
+            hit = places[(places < len(odd)) & (odd.take(places, mode="clip") == voxels)]
+            sets[camera // WORD_BITS, hit] &= ~(np.uint64(1) << np.uint64(camera % WORD_BITS))
+        alive[odd] = rule.enough(sets)
+    return np.flatnonzero(alive)
 
 
 def _cut_at_the_grid(cells: list[np.ndarray], grid: Grid) -> None:

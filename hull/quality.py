@@ -105,7 +105,7 @@ def camera_disagreements(
     surface = binary_surface(blocks)
     # Exits are those of every camera alike, so the vertices stay in the middle where two votes are needed.
     middle = 0.5 * (grid.centres(surface.inner.T) + grid.centres(surface.outer.T)).T
-    vertices = cross_exactly(surface, grid, tables) if votes == 1 else middle
+    vertices = cross_exactly(surface, grid, tables).vertices if votes == 1 else middle
     # With a vote to spare there are more phantoms; the person is the largest piece.
     label = face_pieces(surface.faces, len(vertices))
     largest = int(np.argmax(piece_volumes(vertices, surface.faces, label)))

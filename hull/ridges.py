@@ -14,7 +14,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from hull.surface import exits
+from hull.culling import Culling
+from hull.surface import Crossings, exits
 from hull.tables import OUTSIDE, SilhouetteTable
 
 # In voxels: edges whose middle is deeper than the first are split; nothing is moved further than the second.
@@ -23,34 +24,81 @@ _FARTHEST = 0.5
 
 
 def raise_ridges(
-    vertices: Float[np.ndarray, "v 3"],
+    crossings: Crossings,
     faces: Int[np.ndarray, "f 3"],
     normals: Float[np.ndarray, "v 3"],
     tables: Sequence[SilhouetteTable],
     voxel_m: float,
-) -> tuple[Float[np.ndarray, "v2 3"], Int[np.ndarray, "f2 3"]]:
+    culling: Culling | None = None,
+) -> tuple[Crossings, Int[np.ndarray, "f2 3"]]:
     """Vertices (the given ones first) and faces with the deep edges split. `normals`: outward, unit."""
-    start, end = faces.T, faces[:, [1, 2, 0]].T
+    vertices, cut_by = crossings.vertices, crossings.cut_by
+    start, end = faces.T.ravel(), faces[:, [1, 2, 0]].T.ravel()
     # On a closed surface every edge runs once in each direction: the rising ones name each edge once.
-    forth = (start < end).ravel()
-    names = np.minimum(start, end).ravel() * len(vertices) + np.maximum(start, end).ravel()
-    edges = np.sort(names[forth])
-    a, b = edges // len(vertices), edges % len(vertices)
-    way = normals.T[:, a] + normals.T[:, b]
+    a, b = start[start < end], end[start < end]
+    columns, outward = np.ascontiguousarray(vertices.T), np.ascontiguousarray(normals.T)
+    way = outward[:, a] + outward[:, b]
     length = np.sqrt((way**2).sum(axis=0))
+    way *= voxel_m / np.maximum(length, 1e-30)
+    middle = 0.5 * (columns[:, a] + columns[:, b])
+    places = middle + _DEPTH_SPLIT * way
     deep = np.flatnonzero(length > 0.5)
-    middle = 0.5 * (vertices.T[:, a[deep]] + vertices.T[:, b[deep]])
-    way = way[:, deep] / length[deep] * voxel_m
-    for table in tables:
-        still = table.ask_points(middle + _DEPTH_SPLIT * way) != OUTSIDE
-        deep, middle, way = deep[still], middle[:, still], way[:, still]
-    exit_at, cut = exits(tables, middle, _FARTHEST * way)
-    deep = deep[cut]
-    new = (middle + _FARTHEST * way * exit_at)[:, cut].T
-    number = np.full(len(edges), -1)
-    number[deep] = len(vertices) + np.arange(len(deep))
-    split = number[np.searchsorted(edges, names)].reshape(3, -1).T
-    return np.concatenate([vertices, new]), split_faces(faces, split)
+    deep = _still_inside(tables, places, deep, cut_by[a], cut_by[b], culling)
+    middle, way = middle[:, deep], _FARTHEST * way[:, deep]
+    exit_at, new_cut_by = exits(tables, middle, way, culling)
+    ends = new_cut_by >= 0
+    deep = deep[ends]
+    new = (middle + way * exit_at)[:, ends].T
+    # Both faces at an edge look its new vertex up by the edge's name.
+    order = np.argsort(a[deep] * len(vertices) + b[deep])
+    names = (a[deep] * len(vertices) + b[deep])[order]
+    touched = np.zeros(len(vertices), dtype=bool)
+    touched[a[deep]] = touched[b[deep]] = True
+    sought = np.flatnonzero(touched[start] & touched[end])
+    wanted = np.minimum(start[sought], end[sought]) * len(vertices) + np.maximum(start[sought], end[sought])
+    place = np.minimum(np.searchsorted(names, wanted), max(len(names) - 1, 0))
+    found = names[place] == wanted if len(names) else np.zeros(0, dtype=bool)
+    split = np.full(len(start), -1)
+    split[sought[found]] = len(vertices) + order[place[found]]
+    return (
+        Crossings(np.concatenate([vertices, new]), np.concatenate([cut_by, new_cut_by[ends]])),
+        split_faces(faces, split.reshape(3, -1).T),
+    )
+
+
+def _still_inside(
+    tables: Sequence[SilhouetteTable],
+    places: Float[np.ndarray, "3 n"],
+    chosen: Int[np.ndarray, " m"],
+    cut_by_1: Int[np.ndarray, " n"],
+    cut_by_2: Int[np.ndarray, " n"],
+    culling: Culling | None,
+) -> Int[np.ndarray, " k"]:
+    """Which (K,) of the places (3 N) chosen (M,) no camera sees outside.
+
+    The cameras that cut an edge's ends refuse almost all of its middle, so they are asked first.
+    """
+    for cut_by in (cut_by_1, cut_by_2):
+        order = np.argsort(cut_by[chosen], kind="stable")
+        chosen = chosen[order]
+        limits = np.searchsorted(cut_by[chosen], np.arange(len(tables) + 1))
+        kept = [chosen[: limits[0]]]
+        for table_idx, table in enumerate(tables):
+            asked = chosen[limits[table_idx] : limits[table_idx + 1]]
+            kept.append(asked[table.ask_points(places[:, asked]) != OUTSIDE])
+        chosen = np.concatenate(kept)
+    chosen = np.sort(chosen)
+    places = places[:, chosen]
+    blocks = None if culling is None else culling.blocks_of(places)
+    inside = np.ones(len(chosen), dtype=bool)
+    for table_idx, table in enumerate(tables):
+        if culling is None or blocks is None:
+            asked = np.flatnonzero(inside)
+        else:
+            asked = culling.may_refuse(table_idx, blocks)
+            asked = asked[inside[asked]]
+        inside[asked[table.ask_points(places[:, asked]) == OUTSIDE]] = False
+    return chosen[inside]
 
 
 def split_faces(faces: Int[np.ndarray, "f 3"], middle: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "f2 3"]:

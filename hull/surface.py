@@ -1,7 +1,7 @@
 """From inside cells to a closed surface whose vertices lie on the silhouettes' cones.
 
 Marching cubes gives the topology on the binary grid; then every vertex is moved along its grid edge to where
-the edge leaves the hull, found by bisection in the pictures (marching intersections, Tarini et al. 2002).
+the edge leaves the hull, found in the pictures (marching intersections, Tarini et al. 2002).
 That makes the surface four times as accurate as the grid, without distance transforms.
 """
 
@@ -11,16 +11,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from hull.carve import Blocks, Grid
-from hull.tables import OUTSIDE, SilhouetteTable
+from hull.culling import Culling
+from hull.tables import SilhouetteTable
 
 # A level below one half makes marching cubes join voxels that touch at an edge, always alike: with exactly
 # one half the tables' ties are broken at random and edges with four faces appear.
 _LEVEL = 0.4
-# One 128th of a voxel: far below a pixel.
-_N_HALVINGS = 7
+# A way this many pixels long is halved until a pixel is left; longer ones stay that much coarser.
+_MOST_HALVED = 128.0
+# Then to a hundredth of a pixel.
+_N_FALSE_POSITIONS = 3
 # Crossings keep this share of the edge from its ends, so that no triangle collapses onto a grid point.
 _KEEP_OFF = 0.02
 # Volumes are turned into surfaces in slabs of at most so many voxels.
@@ -92,41 +95,102 @@ def _marched(blocks: Blocks, low: Int[np.ndarray, " 3"], high: Int[np.ndarray, "
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Crossings:
+    """Where the surface's grid edges leave the hull.
+
+    Fields
+    ------
+    vertices : (V 3) world points, metres.
+    cut_by : (V,) the table (its place in the sequence) of the camera whose cone ends the hull there;
+        -1: none, the far end was given up for want of witnesses.
+    """
+
+    vertices: Float[np.ndarray, "v 3"]
+    cut_by: Int[np.ndarray, " v"]
+
+
 def cross_exactly(
-    surface: GridSurface, grid: Grid, tables: Sequence[SilhouetteTable]
-) -> Float[np.ndarray, "v 3"]:
-    """(V 3) world points, metres, where each grid edge leaves the hull."""
+    surface: GridSurface, grid: Grid, tables: Sequence[SilhouetteTable], culling: Culling | None = None
+) -> Crossings:
+    """The surface's vertices on the silhouettes' cones. `culling`: of these tables and this grid."""
     origin = grid.centres(surface.inner.T)
     along = (surface.outer - surface.inner).T * grid.voxel_m
-    exit_at, cut = exits(tables, origin, along)
+    exit_at, cut_by = exits(tables, origin, along, culling)
     # Where no camera refuses the far end, it was given up for want of witnesses: nobody knows better than
     # half way.
-    exit_at[~cut] = 0.5
-    return (origin + along * np.clip(exit_at, _KEEP_OFF, 1.0 - _KEEP_OFF)).T
+    exit_at[cut_by < 0] = 0.5
+    return Crossings((origin + along * np.clip(exit_at, _KEEP_OFF, 1.0 - _KEEP_OFF)).T, cut_by)
 
 
 def exits(
-    tables: Sequence[SilhouetteTable], origin: Float[np.ndarray, "3 n"], along: Float[np.ndarray, "3 n"]
-) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """(N,) where on the way `along` (3 N, metres) from `origin` (inside) the hull ends; whether it does.
+    tables: Sequence[SilhouetteTable],
+    origin: Float[np.ndarray, "3 n"],
+    along: Float[np.ndarray, "3 n"],
+    culling: Culling | None = None,
+) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    """(N,) where on the way `along` (3 N, metres) from `origin` (inside) the hull ends; (N,) the table that
+    ends it, or -1.
 
-    Each camera in turn is asked at the present exit; only where it says "outside" does it shorten the way, by
-    bisection. The exit is thus the first one of all cameras, found with little more than one question per
-    camera.
+    Each camera in turn is asked at the present exit; only where it says "outside" does it shorten the way.
+    The exit is thus the first one of all cameras, found with little more than one question per camera.
+    Cameras that cannot refuse any of it are not asked where `culling` is given.
     """
     exit_at = np.ones(origin.shape[1])
-    cut = np.zeros(origin.shape[1], dtype=bool)
-    for table in tables:
-        refused = np.flatnonzero(table.ask_points(origin + along * exit_at) == OUTSIDE)
+    cut_by = np.full(origin.shape[1], -1, dtype=np.int16)
+    blocks = None if culling is None else culling.blocks_of(origin + 0.5 * along)
+    for table_idx, table in enumerate(tables):
+        if culling is None or blocks is None:
+            asked = np.arange(origin.shape[1])
+        else:
+            asked = culling.may_refuse(table_idx, blocks)
+        base, way = table.projected(origin[:, asked]), table.projected_way(along[:, asked])
+        share = exit_at[asked]
+        value = table.ask_along(base, way, share)
+        refused = np.flatnonzero(value < 0.5)
         if not len(refused):
             continue
-        cut[refused] = True
-        inner, outer = np.zeros(len(refused)), exit_at[refused]
-        base, way = origin[:, refused], along[:, refused]
-        for _ in range(_N_HALVINGS):
-            middle = 0.5 * (inner + outer)
-            outside = table.ask_points(base + way * middle) == OUTSIDE
-            outer = np.where(outside, middle, outer)
-            inner = np.where(outside, inner, middle)
-        exit_at[refused] = 0.5 * (inner + outer)
-    return exit_at, cut
+        cut_by[asked[refused]] = table_idx
+        exit_at[asked[refused]] = _way_out(
+            table, base[:, refused], way[:, refused], share[refused], value[refused]
+        )
+    return exit_at, cut_by
+
+
+def _way_out(
+    table: SilhouetteTable,
+    base: Float[np.ndarray, "3 n"],
+    way: Float[np.ndarray, "3 n"],
+    outer: Float[np.ndarray, " n"],
+    outer_value: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, " n"]:
+    """(N,) where the silhouette's value falls to one half, between 0 (inside) and `outer` (outside).
+
+    Halvings until a pixel is left, where the value begins to tell how far the outline is; then false
+    position (Illinois), which keeps its bracket.
+    """
+    inner = np.zeros(len(outer))
+    inner_value = np.ones(len(outer))
+    end = base + way * outer
+    length = np.abs(end[:2] / end[2] - base[:2] / base[2]).max(axis=0)
+    n_halvings = int(np.ceil(np.log2(np.clip(length.max(), 1.0, _MOST_HALVED))))
+    halved = np.zeros(len(outer), dtype=np.int8)
+    for step in range(n_halvings + _N_FALSE_POSITIONS):
+        if step < n_halvings:
+            place = 0.5 * (inner + outer)
+        else:
+            span = inner_value - outer_value
+            place = inner + (outer - inner) * ((inner_value - 0.5) / np.maximum(span, 1e-9))
+        value = table.ask_along(base, way, place)
+        outside = value < 0.5
+        if step >= n_halvings:
+            # The end that stays twice counts half: false position would creep from one side otherwise.
+            stays_outer = ~outside & (halved == 1)
+            stays_inner = outside & (halved == 2)
+            outer_value = np.where(stays_outer, 0.5 - 0.5 * (0.5 - outer_value), outer_value)
+            inner_value = np.where(stays_inner, 0.5 + 0.5 * (inner_value - 0.5), inner_value)
+            halved = np.where(outside, 2, 1).astype(np.int8)
+        outer, outer_value = np.where(outside, place, outer), np.where(outside, value, outer_value)
+        inner, inner_value = np.where(outside, inner, place), np.where(outside, inner_value, value)
+    span = np.maximum(inner_value - outer_value, 1e-9)
+    return inner + (outer - inner) * ((inner_value - 0.5) / span)

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from capture.camera import Camera
 from hull.errors import HullError
@@ -75,28 +75,34 @@ class SilhouetteTable:
 
     def ask_points(self, points: Float[np.ndarray, "3 n"]) -> UInt8[np.ndarray, " n"]:
         """INSIDE, OUTSIDE or NO_EVIDENCE for each world point. Points are columns: (3 N), metres."""
-        u, v, in_front = self._pixels(points)
-        # Far-off pixels are all the same to us; clipping keeps them inside the integers' range.
-        column = np.floor(np.clip(u, -4.0, self.highest[0] + 4.0))
-        row = np.floor(np.clip(v, -4.0, self.highest[1] + 4.0))
-        seen = in_front & (column >= self.lowest[0]) & (column <= self.highest[0])
-        seen &= (row >= self.lowest[1]) & (row <= self.highest[1])
-        height, width = self.codes.shape
-        x = np.clip(column.astype(np.int64) - self.origin[0], 0, width - 1)
-        y = np.clip(row.astype(np.int64) - self.origin[1], 0, height - 1)
-        codes = self.codes.ravel().take(y * width + x)
-        answers = _ANSWER_OF_CODE[codes]
-        outline = np.flatnonzero(answers == UNDECIDED)
-        if len(outline):
-            fx = u[outline] - column[outline]
-            fy = v[outline] - row[outline]
-            bits = codes[outline]
-            upper = (bits & 1) * (1.0 - fx) + ((bits >> 1) & 1) * fx
-            lower = ((bits >> 2) & 1) * (1.0 - fx) + ((bits >> 3) & 1) * fx
-            value = upper * (1.0 - fy) + lower * fy
-            answers[outline] = np.where(value >= 0.5, np.uint8(INSIDE), np.uint8(OUTSIDE))
-        answers[~seen] = NO_EVIDENCE
+        answers, outline, value = self._looked_up(*self._pixels(points))
+        answers[outline] = np.where(value >= 0.5, np.uint8(INSIDE), np.uint8(OUTSIDE))
         return answers
+
+    def ask_along(
+        self,
+        base: Float[np.ndarray, "3 n"],
+        way: Float[np.ndarray, "3 n"],
+        share: Float[np.ndarray, " n"],
+    ) -> Float[np.ndarray, " n"]:
+        """(N,) how much of a person there is at `base + share * way`: below one half is OUTSIDE.
+
+        `base`, `way`: points and ways as `projected` and `projected_way` give them. Without evidence 1: such
+        a place is not refused.
+        """
+        u, v, depth = base + way * share
+        answers, outline, value = self._looked_up(*_divided(u, v, depth))
+        result = (answers != OUTSIDE).astype(np.float64)
+        result[outline] = value
+        return result
+
+    def projected(self, points: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
+        """World points in the picture, not yet divided by their depth."""
+        return self.projection[:, :3] @ points + self.projection[:, 3:]
+
+    def projected_way(self, ways: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
+        """World ways (differences of points), likewise."""
+        return self.projection[:, :3] @ ways
 
     def ask_cells(self, centres: Float[np.ndarray, "3 n"], half_m: float) -> UInt8[np.ndarray, " n"]:
         """The answers that can occur in each cube of half side `half_m` around the centres (3 N), metres.
@@ -133,14 +139,53 @@ class SilhouetteTable:
 
     def _pixels(
         self, points: Float[np.ndarray, "3 n"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], np.ndarray]:
-        u, v, depth = self.projection[:, :3] @ points + self.projection[:, 3:]
-        in_front = depth > 0.0
-        safe_depth = depth if in_front.all() else np.where(in_front, depth, 1.0)
-        return u / safe_depth, v / safe_depth, in_front
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], np.ndarray | None]:
+        return _divided(*self.projected(points))
+
+    def _looked_up(
+        self, u: Float[np.ndarray, " n"], v: Float[np.ndarray, " n"], in_front: np.ndarray | None
+    ) -> tuple[UInt8[np.ndarray, " n"], Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+        """(N,) answers at pixels; which of them (M,) lie on an outline, and the silhouette's value there.
+
+        `in_front`: None where all are.
+        """
+        height, width = self.codes.shape
+        column, row = np.floor(u), np.floor(v)
+        unseen = None
+        x_0, y_0 = self.origin
+        if len(u) and not (
+            in_front is None
+            and column.min() >= max(x_0, self.lowest[0])
+            and column.max() <= min(x_0 + width - 1, self.highest[0])
+            and row.min() >= max(y_0, self.lowest[1])
+            and row.max() <= min(y_0 + height - 1, self.highest[1])
+        ):
+            unseen = (column < self.lowest[0]) | (column > self.highest[0])
+            unseen |= (row < self.lowest[1]) | (row > self.highest[1])
+            if in_front is not None:
+                unseen |= ~in_front
+            # What lies beyond the stored codes equals the nearest stored one.
+            place = np.minimum(np.maximum(row, y_0), y_0 + height - 1) - y_0
+            place *= width
+            place += np.minimum(np.maximum(column, x_0), x_0 + width - 1) - x_0
+        else:
+            place = (row - y_0) * width
+            place += column - x_0
+        codes = self.codes.ravel().take(place.astype(np.intp))
+        answers = _ANSWER_OF_CODE.take(codes)
+        if unseen is not None:
+            answers[unseen] = NO_EVIDENCE
+        outline = np.flatnonzero(answers == UNDECIDED)
+        fx = u[outline] - column[outline]
+        fy = v[outline] - row[outline]
+        bits = codes[outline]
+        upper = (bits & 1) * (1.0 - fx) + ((bits >> 1) & 1) * fx
+        lower = ((bits >> 2) & 1) * (1.0 - fx) + ((bits >> 3) & 1) * fx
+        return answers, outline, upper * (1.0 - fy) + lower * fy
 
     def _clipped(self, pixel: Float[np.ndarray, " n"], axis: int) -> np.ndarray:
-        return np.floor(np.clip(pixel, -4.0, self.highest[axis] + 4.0)).astype(np.int64)
+        # Far-off pixels are all the same to us; clipping keeps them inside the integers' range.
+        return np.floor(np.minimum(np.maximum(pixel, -4.0), self.highest[axis] + 4.0)).astype(np.int64)
 
     def _answers_in(
         self, column_0: np.ndarray, column_1: np.ndarray, row_0: np.ndarray, row_1: np.ndarray
@@ -149,8 +194,9 @@ class SilhouetteTable:
         levels, height, width = self.squares.shape
         left, right = (column_0 - self.origin[0]) >> 2, (column_1 - self.origin[0]) >> 2
         top, bottom = (row_0 - self.origin[1]) >> 2, (row_1 - self.origin[1]) >> 2
-        x_0, x_1 = np.clip(left, 0, width - 1), np.clip(right, 0, width - 1)
-        y_0, y_1 = np.clip(top, 0, height - 1), np.clip(bottom, 0, height - 1)
+        # np.clip costs more than the comparisons for the few cells that there often are.
+        x_0, x_1 = (np.minimum(np.maximum(side, 0), width - 1) for side in (left, right))
+        y_0, y_1 = (np.minimum(np.maximum(side, 0), height - 1) for side in (top, bottom))
         side = np.maximum(x_1 - x_0, y_1 - y_0) + 1
         level = _LEVEL_OF_SIDE.take(np.minimum(side, len(_LEVEL_OF_SIDE) - 1))
         too_large = level >= levels
@@ -170,6 +216,17 @@ class SilhouetteTable:
         # All that is not stored is background (or beyond the picture, which the caller adds).
         answers[(right < 0) | (left >= width) | (bottom < 0) | (top >= height)] = OUTSIDE
         return answers
+
+
+def _divided(
+    u: Float[np.ndarray, " n"], v: Float[np.ndarray, " n"], depth: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], np.ndarray | None]:
+    """Pixels, and which are in front of the camera; None: all of them."""
+    if not len(depth) or depth.min() > 0.0:
+        return u / depth, v / depth, None
+    in_front = depth > 0.0
+    safe_depth = np.where(in_front, depth, 1.0)
+    return u / safe_depth, v / safe_depth, in_front
 
 
 def prepare_tables(rig: Iterable[Camera], images: Sequence[np.ndarray | None]) -> tuple[SilhouetteTable, ...]:

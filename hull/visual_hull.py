@@ -16,11 +16,12 @@ from capture.camera import Camera
 from hull.bounds import Bounds, bounds_from_tables
 from hull.carve import Grid, carve
 from hull.cleaning import is_closed, keep_what_matters, vertex_normals
+from hull.culling import Culling
 from hull.diagnosis import why_empty
 from hull.errors import HullError
 from hull.ridges import raise_ridges
 from hull.surface import binary_surface, cross_exactly
-from hull.tables import NO_EVIDENCE, SilhouetteTable, prepare_tables
+from hull.tables import NO_EVIDENCE, prepare_tables
 from hull.witnesses import witness_rule
 
 __all__ = ["Hull", "HullError", "build_hull"]
@@ -78,17 +79,23 @@ def build_hull(
     if not blocks.n_voxels:
         raise HullError(why_empty(tables, rule, bounds.low, bounds.high))
     surface = binary_surface(blocks)
-    vertices = cross_exactly(surface, grid, tables)
-    vertices, faces = raise_ridges(
-        vertices, surface.faces, vertex_normals(vertices, surface.faces), tables, voxel_m
+    culling = Culling(tables, grid)
+    crossings = cross_exactly(surface, grid, tables, culling)
+    crossings, faces = raise_ridges(
+        crossings,
+        surface.faces,
+        vertex_normals(crossings.vertices, surface.faces),
+        tables,
+        voxel_m,
+        culling,
     )
-    vertices, faces, problems = keep_what_matters(vertices, faces, tables)
+    vertices, faces, problems = keep_what_matters(crossings.vertices, faces, tables)
     assert is_closed(faces, len(vertices)), "the hull's surface is not closed"
     return Hull(
         vertices=vertices,
         faces=faces,
         normals=vertex_normals(vertices, faces),
-        n_witnesses=_n_witnesses(tables, vertices),
+        n_witnesses=_n_witnesses(culling, vertices),
         problems=problems + _touching(blocks.span(), grid),
     )
 
@@ -106,12 +113,13 @@ def grid_over(bounds: Bounds, voxel_m: float) -> Grid:
     return Grid(first * voxel_m, voxel_m, (nx, ny, nz))
 
 
-def _n_witnesses(
-    tables: Sequence[SilhouetteTable], vertices: Float[np.ndarray, "v 3"]
-) -> Int[np.ndarray, " v"]:
+def _n_witnesses(culling: Culling, vertices: Float[np.ndarray, "v 3"]) -> Int[np.ndarray, " v"]:
     count = np.zeros(len(vertices), dtype=np.int64)
-    for table in tables:
-        count += table.ask_points(vertices.T) != NO_EVIDENCE
+    blocks = culling.blocks_of(vertices.T)
+    for table_idx, table in enumerate(culling.tables):
+        seen, unsure = culling.evidence(table_idx, blocks)
+        seen[unsure] = table.ask_points(vertices[unsure].T) != NO_EVIDENCE
+        count += seen
     return count
 
 

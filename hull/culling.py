@@ -1,0 +1,71 @@
+"""Which cameras need not be asked about a place.
+
+Near most of the hull's surface only few cameras have an outline; the others see the whole neighbourhood
+inside (or not at all), and asking them point by point is what a plain hull spends most of its time on. Space
+is cut into blocks of a few voxels; each block that a question falls into is asked once as a whole cell, by
+every camera, and the answers hold for all the points in it. Nothing changes but the time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from hull.carve import Grid
+from hull.tables import NO_EVIDENCE, OUTSIDE, SilhouetteTable
+
+# Voxels a block's side. Smaller blocks spare more questions about points and ask more about blocks.
+BLOCK_VOXELS = 4
+# In voxels: how far from the place that names the block a question may be asked.
+REACH_VOXELS = 0.55
+
+
+class Culling:
+    """The answers of all cameras (tables) about blocks of a grid, asked when first needed."""
+
+    def __init__(self, tables: Sequence[SilhouetteTable], grid: Grid) -> None:
+        self.tables = tuple(tables)
+        # A vertex lies up to a voxel beyond the voxels' centres, and ridges are raised a little further.
+        self._blocks = Grid(
+            grid.low - BLOCK_VOXELS * grid.voxel_m,
+            BLOCK_VOXELS * grid.voxel_m,
+            tuple(n // BLOCK_VOXELS + 3 for n in grid.shape),  # type: ignore[arg-type]
+        )
+        self._half_m = (0.5 * BLOCK_VOXELS + REACH_VOXELS) * grid.voxel_m
+        self._number = np.full(int(np.prod(self._blocks.shape)), -1, dtype=np.int32)
+        self._answers = np.zeros((len(self.tables), 0), dtype=np.uint8)
+
+    def blocks_of(self, places: Float[np.ndarray, "3 n"]) -> Int[np.ndarray, " n"]:
+        """(N,) the block of each place (3 N), world metres: a number for `may_refuse` and `may_be_blind`."""
+        low, shape = self._blocks.low, self._blocks.shape
+        i, j, k = ((places[axis] - low[axis]) * (1.0 / self._blocks.voxel_m) for axis in range(3))
+        name = i.astype(np.intp)
+        for axis, place in ((1, j), (2, k)):
+            name *= shape[axis]
+            name += place.astype(np.intp)
+        number = self._number.take(name)
+        if (new := name[number < 0]).size:
+            self._ask(np.unique(new))
+            number = self._number.take(name)
+        return number
+
+    def may_refuse(self, table_idx: int, blocks: Int[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
+        """Which (M,) of the blocks (N,) this camera may see outside, in part at least."""
+        return np.flatnonzero((self._answers[table_idx] & OUTSIDE).take(blocks))
+
+    def evidence(
+        self, table_idx: int, blocks: Int[np.ndarray, " n"]
+    ) -> tuple[Bool[np.ndarray, " n"], Int[np.ndarray, " m"]]:
+        """(N,) whether this camera gives evidence about the blocks, and which (M,) of them are to be asked
+        point by point, since it does so in part only."""
+        answers = self._answers[table_idx].take(blocks)
+        return answers & NO_EVIDENCE == 0, np.flatnonzero(answers > NO_EVIDENCE)
+
+    def _ask(self, names: Int[np.ndarray, " n"]) -> None:
+        self._number[names] = self._answers.shape[1] + np.arange(len(names), dtype=np.int32)
+        cells = np.stack(np.unravel_index(names, self._blocks.shape))
+        centres = self._blocks.centres(cells)
+        answers = np.stack([table.ask_cells(centres, self._half_m) for table in self.tables])
+        self._answers = np.concatenate([self._answers, answers], axis=1)
