@@ -179,10 +179,12 @@ def find_inverted(folders: ImageFolders) -> frozenset[str]:
     inverted = set()
     for camera, files in folders.silhouettes.items():
         frames = sorted(files)
-        probes = [
-            read_silhouette(files[frame]) for frame in {frames[0], frames[len(frames) // 2], frames[-1]}
-        ]
-        readable = [probe for probe in probes if probe.mask is not None]
-        if readable and all(probe.looks_inverted for probe in readable):
+        looks = set()
+        for frame in sorted({frames[0], frames[len(frames) // 2], frames[-1]}):
+            if (probe := read_silhouette(files[frame])).mask is not None:
+                looks.add(probe.looks_inverted)
+            if False in looks:
+                break  # one that is not settles it, without reading the others
+        if looks == {True}:
             inverted.add(camera)
     return frozenset(inverted)
