@@ -17,6 +17,7 @@ from bodyhull.body_commands import Body, perform_body
 from bodyhull.config import RunConfig
 from bodyhull.errors import ERROR, FRAMES_FAILED, OK, UserError
 from bodyhull.folder import RunFolder
+from bodyhull.study_commands import RigStudy, perform_rig_study
 
 if TYPE_CHECKING:
     from fit.settings import FitSettings
@@ -125,6 +126,7 @@ Command = (
     | Annotated[Overlay, tyro.conf.subcommand("overlay")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Body, tyro.conf.subcommand("body")]
+    | Annotated[RigStudy, tyro.conf.subcommand("rig-study")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
 )
@@ -221,6 +223,8 @@ def perform(command: object) -> int:
             return synthesise(command)
         case Body():
             return perform_body(command)
+        case RigStudy():
+            return perform_rig_study(command)
         case Doctor():
             from bodyhull.doctor import findings, print_findings
 

@@ -18,6 +18,9 @@ from jaxtyping import UInt8
 
 from .overlay import shrunk
 
+WIDE_PX = 2000
+"""Longest side of `ReportData.pictures`."""
+
 
 @dataclass(frozen=True)
 class Image:
@@ -58,8 +61,8 @@ class ReportData:
 
     title; subtitle: a sentence; headline: the few (name, value) that matter most, shown large; problems: a
     sentence each, what went wrong or was found odd (empty: the page says so); facts: (name, value) of the
-    run; tables; sheet_headers and sheet: the contact sheet; films: (caption, path relative to the report's
-    folder) of MP4 files.
+    run; pictures: wide ones, one under the other; tables; sheet_headers and sheet: the contact sheet; films:
+    (caption, path relative to the report's folder) of MP4 files.
     """
 
     title: str
@@ -67,6 +70,7 @@ class ReportData:
     headline: tuple[tuple[str, str], ...] = ()
     problems: tuple[str, ...] = ()
     facts: tuple[tuple[str, str], ...] = ()
+    pictures: tuple[Image, ...] = ()
     tables: tuple[Table, ...] = ()
     sheet_headers: tuple[str, ...] = ()
     sheet: tuple[Row, ...] = ()
@@ -108,6 +112,7 @@ def render_page(data: ReportData, image_px: int = 420) -> str:
 
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["inline"] = lambda image: data_url(image.pixels, image_px)
+    environment.filters["inline_wide"] = lambda image: data_url(image.pixels, WIDE_PX)
     environment.globals["cell"] = _cell
     template = environment.from_string(
         (Path(__file__).parent / "report.html.jinja").read_text(encoding="utf-8")

@@ -57,6 +57,10 @@ TRUTH_JOINTS = {
 """The truth file's joints by our own."""
 
 
+Spoil = Callable[[int, int, np.ndarray], np.ndarray]
+"""(camera, frame, silhouette) -> the silhouette as a worse segmentation would give it."""
+
+
 class SyntheticError(ValueError):
     """A film that cannot be made: what was asked for and what there is."""
 
@@ -144,9 +148,18 @@ def film(
 
 
 def film_performance(
-    place: Path, performance: Performance, rig: Rig, *, pictures: bool = True, progress: bool = True
+    place: Path,
+    performance: Performance,
+    rig: Rig,
+    *,
+    pictures: bool = True,
+    spoil: Spoil | None = None,
+    progress: bool = True,
 ) -> None:
-    """Draw every frame with every camera and write silhouettes, and pictures if wanted, below `place`."""
+    """Draw every frame with every camera and write silhouettes, and pictures if wanted, below `place`.
+
+    spoil: what becomes of each silhouette (camera, frame, silhouette) before it is written.
+    """
     renderer = Renderer(*rig[0].size)
     lights = studio_lights(UP)
     backgrounds = [_studio(camera) for camera in rig] if pictures else []
@@ -173,6 +186,8 @@ def film_performance(
                 else:
                     mask = stage.silhouette(camera)[0]
                 silhouette = np.where(mask, np.uint8(255), np.uint8(0))
+                if spoil is not None:
+                    silhouette = spoil(camera_idx, frame_idx, silhouette)
                 _write_png(place / "SilhouettesPictures" / label / f"silh_{frame_idx:06d}.png", silhouette)
                 bar.update()
 
