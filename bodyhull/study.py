@@ -215,6 +215,9 @@ def _kept(out: Path, case: Case, key: str) -> Outcome | None:
 
 
 def _one_thread_each() -> None:
-    """The children share the cores: each library keeps to one thread (set before they start)."""
+    """The children share the cores and the terminal: each library keeps to one thread, and no child shows
+    bars.
+    """
+    os.environ.setdefault("TQDM_DISABLE", "1")
     for library in ("OMP", "OPENBLAS", "MKL"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
