@@ -39,7 +39,7 @@ class StudySubject:
     seed: int = 7
     garment: str = "tshirt-trousers"
     motion: str = "tilt-twist"
-    frames: int = 4
+    frames: int = 8
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ class RigStudy:
     """How many cameras where something else is tried."""
     base_width: int = 1024
     """Picture width where something else is tried."""
-    frames: int = 4
+    frames: int = 8
     """Frames of the motion."""
     motion: str = "tilt-twist"
     """What the person does; an unknown name lists them all."""
