@@ -18,7 +18,8 @@ from bodyhull.errors import UserError
 from bodyhull.folder import RunFolder, write_atomically
 from capture.recording import Recording, open_recording
 from hull.errors import HullError
-from hull.mesh_file import MeshFileError, load_mesh, save_mesh
+from hull.hull_file import facts_file, load_hull, save_hull
+from hull.mesh_file import MeshFileError
 from hull.quality import silhouette_agreement
 from hull.visual_hull import build_hull
 
@@ -175,7 +176,7 @@ def _carved(folder: RunFolder, frame_id: int, known: dict[str, Any]) -> bool:
     if entry["status"] == "failed":
         return True
     try:
-        load_mesh(folder.hull(frame_id))
+        load_hull(folder.hull(frame_id))
     except (OSError, MeshFileError):
         return False
     return True
@@ -192,11 +193,12 @@ def carve_frame(recording: Recording, folder: RunFolder, frame_id: int, voxel_mm
         message = f"frame {frame_id:06d}: {error}"
         tqdm.write(f"warning: {message}", file=sys.stderr)
         folder.hull(frame_id).unlink(missing_ok=True)
+        facts_file(folder.hull(frame_id)).unlink(missing_ok=True)
         return CarvedFrame(frame_id, "failed", (*silhouettes.problems, message))
     agreement = silhouette_agreement(hull.vertices, hull.faces, recording.rig, silhouettes.images)
     path = folder.hull(frame_id)
     path.parent.mkdir(parents=True, exist_ok=True)
-    save_mesh(path, hull.vertices, hull.faces, normals=hull.normals)
+    save_hull(path, hull)
     problems = (*silhouettes.problems, *hull.problems)
     return CarvedFrame(
         frame_id,

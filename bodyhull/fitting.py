@@ -29,18 +29,14 @@ from fit.settings import FitSettings
 from fit.solver import Fitter
 from fit.state import BodyState
 from fit.track import TrackedFrame, posed_vertices, track_sequence
-from hull.mesh_file import load_mesh, load_normals, save_mesh
+from hull.hull_file import load_hull
+from hull.mesh_file import load_mesh, save_mesh
 from hull.scan import Scan
-from hull.visual_hull import Hull
 
 
 def load_hull_scan(path: Path, n_points: int, seed: int) -> Scan:
     """An all-cloth scan of the hull in a file, world frame."""
-    vertices, faces = load_mesh(path)
-    normals = load_normals(path)
-    assert normals is not None, f"{path} was written with normals"
-    hull = Hull(vertices, faces, normals, np.zeros(len(vertices), dtype=np.int64))
-    return Scan.from_hull(hull, n_points, seed)
+    return Scan.from_hull(load_hull(path), n_points, seed)
 
 
 def fit_stage(config: RunConfig, settings: FitSettings | None = None) -> None:

@@ -21,6 +21,7 @@ from bodyhull.errors import UserError
 OWN_FILES = (
     "capture/rig.json",
     "hull/[0-9][0-9][0-9][0-9][0-9][0-9]*.ply",
+    "hull/[0-9][0-9][0-9][0-9][0-9][0-9]*.npz",
     "fit/alignments/*.npz",
     "fit/fusion.npz",
     "fit/fusion.ply",

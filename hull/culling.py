@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hull.carve import Grid
-from hull.tables import NO_EVIDENCE, OUTSIDE, SilhouetteTable
+from hull.tables import INSIDE, NO_EVIDENCE, OUTSIDE, SilhouetteTable
 
 # Voxels a block's side. Smaller blocks spare more questions about points and ask more about blocks.
 BLOCK_VOXELS = 4
@@ -62,6 +62,11 @@ class Culling:
         point by point, since it does so in part only."""
         answers = self._answers[table_idx].take(blocks)
         return answers & NO_EVIDENCE == 0, np.flatnonzero(answers > NO_EVIDENCE)
+
+    def may_be_outlined(self, table_idx: int, blocks: Int[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
+        """Which (M,) of the blocks (N,) this camera's outline may pass through."""
+        mixed = INSIDE | OUTSIDE
+        return np.flatnonzero((self._answers[table_idx] & mixed == mixed).take(blocks))
 
     def _ask(self, names: Int[np.ndarray, " n"]) -> None:
         self._number[names] = self._answers.shape[1] + np.arange(len(names), dtype=np.int32)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Integer
+from jaxtyping import Bool, Float, Int, Integer
 
 from capture.camera import Camera
 
@@ -66,6 +66,21 @@ class RayScene:
         rays = self._rays(origin, points - origin)
         return self._scene.test_occlusions(_as_tensor(rays), nthreads=self._n_threads).numpy()
 
+    def first_hits(
+        self, starts: Float[np.ndarray, "n 3"], ways: Float[np.ndarray, "n 3"]
+    ) -> Float[np.ndarray, " n"]:
+        """(N,) metres along each unit way (N 3) from its start (N 3) to the surface; inf where it misses."""
+        rays = _as_tensor(self._rays(starts, ways))
+        hits = self._scene.cast_rays(rays, nthreads=self._n_threads)
+        return hits["t_hit"].numpy().astype(np.float64)
+
+    def n_crossings(
+        self, starts: Float[np.ndarray, "n 3"], ways: Float[np.ndarray, "n 3"]
+    ) -> Int[np.ndarray, " n"]:
+        """(N,) how often each half line from a start (N 3) along a way (N 3) crosses the surface."""
+        rays = _as_tensor(self._rays(starts, ways))
+        return self._scene.count_intersections(rays, nthreads=self._n_threads).numpy().astype(np.int64)
+
     def signed_distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """(N,) metres from the surface, negative inside, to about a micrometre."""
         query = _as_tensor((points - self._middle).astype(np.float32))
@@ -75,7 +90,7 @@ class RayScene:
         return np.where(occupied > 0.5, -distance, distance)
 
     def _rays(
-        self, origin: Float[np.ndarray, " 3"], ways: Float[np.ndarray, "*n 3"]
+        self, origin: Float[np.ndarray, "*m 3"], ways: Float[np.ndarray, "*n 3"]
     ) -> Float[np.ndarray, "*n 6"]:
         rays = np.empty((*ways.shape[:-1], 6), dtype=np.float32)
         rays[..., :3] = origin - self._middle

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from capture.camera import Camera
 from hull.bounds import Bounds, bounds_from_tables
@@ -21,7 +21,8 @@ from hull.diagnosis import why_empty
 from hull.errors import HullError
 from hull.ridges import raise_ridges
 from hull.surface import binary_surface, cross_exactly
-from hull.tables import NO_EVIDENCE, prepare_tables
+from hull.tables import prepare_tables
+from hull.vertex_facts import vertex_facts
 from hull.witnesses import witness_rule
 
 __all__ = ["Hull", "HullError", "build_hull"]
@@ -37,6 +38,14 @@ class Hull:
     faces : (F 3), vertex indices; counter-clockwise seen from outside, every edge in two faces.
     normals : (V 3), unit, outward.
     n_witnesses : (V,), how many cameras give evidence at the vertex.
+    n_bounding : (V,), how many cameras' outlines pass through the vertex, within a pixel: those that bound
+        it.
+    cut_by : (V,), place in the rig of the camera on whose cone the vertex lies; -1: on none, given up for
+        want of witnesses.
+    slack_m : (V,), metres that the surface could move inwards around the vertex without a silhouette
+        noticing.
+    is_phantom : (V,), true on parts that no silhouette needs.
+    colours : (V 3) RGB from the pictures, or None.
     problems : one sentence each about what had to be left out or decided.
     """
 
@@ -44,7 +53,31 @@ class Hull:
     faces: Int[np.ndarray, "f 3"]
     normals: Float[np.ndarray, "v 3"]
     n_witnesses: Int[np.ndarray, " v"]
+    n_bounding: Int[np.ndarray, " v"]
+    cut_by: Int[np.ndarray, " v"]
+    slack_m: Float[np.ndarray, " v"]
+    is_phantom: Bool[np.ndarray, " v"]
+    colours: UInt8[np.ndarray, "v 3"] | None = None
     problems: tuple[str, ...] = ()
+
+    @staticmethod
+    def of_mesh(
+        vertices: Float[np.ndarray, "v 3"],
+        faces: Int[np.ndarray, "f 3"],
+        normals: Float[np.ndarray, "v 3"] | None = None,
+    ) -> Hull:
+        """A closed surface from elsewhere, of which only the shape is known: no witnesses, no slack."""
+        none = np.zeros(len(vertices), dtype=np.int64)
+        return Hull(
+            vertices=vertices,
+            faces=faces,
+            normals=vertex_normals(vertices, faces) if normals is None else normals,
+            n_witnesses=none,
+            n_bounding=none,
+            cut_by=none - 1,
+            slack_m=np.zeros(len(vertices)),
+            is_phantom=np.zeros(len(vertices), dtype=bool),
+        )
 
     @property
     def volume_m3(self) -> float:
@@ -84,18 +117,20 @@ def build_hull(
     crossings, faces = raise_ridges(
         crossings,
         surface.faces,
-        vertex_normals(crossings.vertices, surface.faces),
+        vertex_normals(crossings.vertices, surface.faces, n_rings=1),
         tables,
         voxel_m,
         culling,
     )
-    vertices, faces, problems = keep_what_matters(crossings.vertices, faces, tables)
+    kept, faces, problems = keep_what_matters(crossings.vertices, faces, tables)
+    vertices, cut_by = crossings.vertices[kept], crossings.cut_by[kept]
     assert is_closed(faces, len(vertices)), "the hull's surface is not closed"
+    normals = vertex_normals(vertices, faces)
     return Hull(
         vertices=vertices,
         faces=faces,
-        normals=vertex_normals(vertices, faces),
-        n_witnesses=_n_witnesses(culling, vertices),
+        normals=normals,
+        **vars(vertex_facts(vertices, faces, normals, cut_by, culling)),
         problems=problems + _touching(blocks.span(), grid),
     )
 
@@ -111,16 +146,6 @@ def grid_over(bounds: Bounds, voxel_m: float) -> Grid:
             f"{nx} x {ny} x {nz} voxels; are the cameras in metres? Give a larger voxel or smaller bounds"
         )
     return Grid(first * voxel_m, voxel_m, (nx, ny, nz))
-
-
-def _n_witnesses(culling: Culling, vertices: Float[np.ndarray, "v 3"]) -> Int[np.ndarray, " v"]:
-    count = np.zeros(len(vertices), dtype=np.int64)
-    blocks = culling.blocks_of(vertices.T)
-    for table_idx, table in enumerate(culling.tables):
-        seen, unsure = culling.evidence(table_idx, blocks)
-        seen[unsure] = table.ask_points(vertices[unsure].T) != NO_EVIDENCE
-        count += seen
-    return count
 
 
 def _touching(span: tuple[np.ndarray, np.ndarray], grid: Grid) -> tuple[str, ...]:

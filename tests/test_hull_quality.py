@@ -108,7 +108,7 @@ def test_signed_distance_and_share_outside_of_a_box() -> None:
     assert signed_distance(points, vertices, faces) == pytest.approx(expected, abs=1e-5)
     far = np.array([1000.0, -500, 200])
     assert signed_distance(points + far, vertices + far, faces) == pytest.approx(expected, abs=1e-5)
-    hull = Hull(vertices, faces, np.zeros_like(vertices), np.zeros(8, dtype=int))
+    hull = Hull.of_mesh(vertices, faces)
     assert share_outside(points, hull) == 0.6
     assert share_outside(points, hull, tolerance_m=0.03) == 0.4
 

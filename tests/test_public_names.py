@@ -17,6 +17,8 @@ FUNCTIONS = {
     "hull.quality.silhouette_agreement": "vertices faces rig images",
     "hull.mesh_file.save_mesh": "path vertices faces normals",
     "hull.mesh_file.load_mesh": "path",
+    "hull.hull_file.save_hull": "path hull",
+    "hull.hull_file.load_hull": "path",
     "fit.body.load_body": "spec",
     "fit.body.body_file.read_body_file": "path",
     "fit.frames.recording_from_body": "up",
@@ -37,7 +39,8 @@ FIELDS = {
     "capture.recording.Recording": "name rig calibration frame_ids up unit metres_per_unit notes",
     "capture.recording.Silhouettes": "frame_id images problems",
     "hull.bounds.Bounds": "low high",
-    "hull.visual_hull.Hull": "vertices faces normals n_witnesses problems",
+    "hull.visual_hull.Hull": "vertices faces normals n_witnesses n_bounding cut_by slack_m "
+    "is_phantom colours",
     "hull.scan.Scan": "points normals faces is_skin weight",
     "fit.body.BodyModel": "name licence template faces shape_directions pose_directions weights "
     "joint_regressor parents parts landmarks n_anthropometric kind gender notes",
@@ -59,6 +62,7 @@ METHODS = {
     "capture.rig.Rig": "names save load with_world_scaled pinholes",
     "capture.recording.Recording": "silhouettes picture fingerprint",
     "hull.scan.Scan": "from_hull",
+    "hull.visual_hull.Hull": "of_mesh volume_m3 problems",
     "fit.body.BodyModel": "content_hash save load of_file as_file shaped with_betas",
     "fit.body.body_file.BodyFile": "save",
 }

@@ -33,7 +33,8 @@ def track(tiny: TinyRun) -> dict[str, np.ndarray]:
 
 def test_the_files_that_other_programs_rely_on(tiny: TinyRun) -> None:
     wanted = {"run.json", "capture/rig.json", "fit/fusion.ply", "fit/fusion.npz", "fit/track.npz"}
-    wanted |= {f"hull/{k:06d}.ply" for k in FITTED} | {f"fit/meshes/{k:06d}.ply" for k in FITTED}
+    wanted |= {f"hull/{k:06d}.{kind}" for k in FITTED for kind in ("ply", "npz")}
+    wanted |= {f"fit/meshes/{k:06d}.ply" for k in FITTED}
     wanted |= {f"fit/alignments/{k:06d}.npz" for k in FITTED}
     wanted |= {f"render/overlay/{name}.mp4" for name in CAMERAS} | {"render/report.html"}
     assert set(tiny.times()) == wanted

@@ -16,11 +16,13 @@ from bodyhull.errors import UserError
 from bodyhull.fitting import fit_stage, keypoints_print
 from bodyhull.folder import RunFolder, load_arrays
 from fit.body.pose_prior import PosePrior
+from hull.hull_file import facts_file
 from hull.mesh_file import load_mesh
 from tests.command_line import call
 from tests.tiny_run import DEGRADED, SETTINGS, VOXEL_MM, TinyRun, silhouette, times
 
 Capture = pytest.CaptureFixture[str]
+HULL_FILES = ("hull/000000.ply", "hull/000000.npz", "hull/000001.ply", "hull/000001.npz")
 
 
 def remade(root: Path, before: dict[str, int]) -> set[str]:
@@ -40,8 +42,8 @@ def test_what_was_lost_or_damaged_is_redone_and_nothing_else(tiny: TinyRun, tmp_
     config = tiny.copy(tmp_path / "run")
     folder = RunFolder(config.out)
     folder.hull(0).unlink()
-    hull = folder.hull(1).read_bytes()
-    folder.hull(1).write_bytes(hull[: len(hull) // 2])
+    facts = facts_file(folder.hull(1)).read_bytes()
+    facts_file(folder.hull(1)).write_bytes(facts[: len(facts) // 2])
     alignment = folder.alignment(DEGRADED).read_bytes()
     folder.alignment(DEGRADED).write_bytes(alignment[: len(alignment) // 2])
     folder.track.unlink()
@@ -52,7 +54,7 @@ def test_what_was_lost_or_damaged_is_redone_and_nothing_else(tiny: TinyRun, tmp_
     assert cli.run(config, SETTINGS) == 3
     new = remade(config.out, before)
     assert new == {
-        "run.json", "hull/000000.ply", "hull/000001.ply", f"fit/alignments/{DEGRADED:06d}.npz",
+        "run.json", *HULL_FILES, f"fit/alignments/{DEGRADED:06d}.npz",
         "fit/fusion.npz", "fit/fusion.ply", "fit/track.npz", "render/overlay/cam-003.mp4",
         "render/report.html",
         *(f"fit/meshes/{k:06d}.ply" for k in (0, 1, DEGRADED)),
@@ -189,7 +191,7 @@ def test_overwrite_redoes_and_clears(tiny: TinyRun, tmp_path: Path, capsys: Capt
     )
     assert said.code == 0, said.err
     assert set(times(config.out)) == {
-        "run.json", "capture/rig.json", "hull/000000.ply", "hull/000001.ply", "notes.txt",
+        "run.json", "capture/rig.json", *HULL_FILES, "notes.txt",
     }  # fmt: skip
     state = RunFolder(config.out).read_state()
     assert set(state["stages"]) == {"hull"} and state["configuration"]["voxel_mm"] == 25.0
@@ -216,7 +218,7 @@ def test_a_damaged_run_json(tiny: TinyRun, tmp_path: Path, capsys: Capture) -> N
     said = call(
         capsys, "carve", tiny.recording, "--out", config.out, "--voxel-mm", 25, "--frames", "0", "--overwrite"
     )
-    assert said.code == 0 and set(times(config.out)) == {"run.json", "capture/rig.json", "hull/000000.ply"}
+    assert said.code == 0 and set(times(config.out)) == {"run.json", "capture/rig.json", *HULL_FILES[:2]}
 
 
 def test_run_json_of_another_version(tiny: TinyRun, tmp_path: Path, capsys: Capture) -> None:

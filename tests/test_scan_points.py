@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hull.cleaning import vertex_normals
 from hull.scan import Scan, even_samples
 from hull.visual_hull import Hull
 
@@ -27,7 +26,7 @@ def _sphere(n: int = 48) -> Hull:
             a, b = i * columns + k, j * columns + k
             faces += [[a, a + 1, b], [b, a + 1, b + 1]]
     table = np.array(faces)
-    return Hull(vertices, table, vertex_normals(vertices, table), np.zeros(len(vertices), dtype=int))
+    return Hull.of_mesh(vertices, table)
 
 
 def test_all_cloth_with_unit_weights_and_normals() -> None:
