@@ -90,8 +90,11 @@ class _Front:
     without: UInt64[np.ndarray, "w n"]
     n_outside: np.ndarray
 
-    def kept(self, keep: np.ndarray) -> _Front:
-        return _Front(self.cells[:, keep], self.unasked[:, keep], self.without[:, keep], self.n_outside[keep])
+    def kept(self, keep: Bool[np.ndarray, " n"]) -> _Front:
+        # Three times as fast as picking with the flags themselves.
+        chosen = np.flatnonzero(keep)
+        known = (self.cells, self.unasked, self.without, self.n_outside)
+        return _Front(*(each.take(chosen, axis=-1) for each in known))
 
     def inside(self, rule: WitnessRule) -> UInt64[np.ndarray, "w n"]:
         return rule.full()[:, None] & ~(self.unasked | self.without)
@@ -182,7 +185,7 @@ def _asked(front: _Front, camera: int, alive: Bool[np.ndarray, " m"]) -> Int[np.
     bit = np.uint64(1) << np.uint64(camera % WORD_BITS)
     parents = np.flatnonzero(front.unasked[camera // WORD_BITS] & bit)
     chosen = (parents[:, None] * family + np.arange(family)).ravel()
-    return chosen[alive[chosen]]
+    return chosen.take(np.flatnonzero(alive.take(chosen)))
 
 
 def _ask(
@@ -216,7 +219,7 @@ def _ask(
         asked = _asked(parents, camera, alive)
         if not len(asked):
             continue
-        answers = tables[camera].ask_cells(centres[:, asked], half_m)
+        answers = tables[camera].ask_cells(centres.take(asked, axis=1), half_m)
         outside = asked[answers == OUTSIDE]
         front.unasked[word, asked[answers == INSIDE]] &= ~bit
         if votes == 1:
@@ -258,7 +261,7 @@ def _ask_voxels(
         asked = _asked(parents, camera, alive)
         if not len(asked):
             continue
-        answers = tables[camera].ask_points(centres[:, asked])
+        answers = tables[camera].ask_points(centres.take(asked, axis=1))
         outside = asked[answers == OUTSIDE]
         n_outside[outside] += 1
         alive[outside[n_outside[outside] >= votes]] = False

@@ -36,6 +36,7 @@ class Culling:
         self._half_m = (0.5 * BLOCK_VOXELS + REACH_VOXELS) * grid.voxel_m
         self._number = np.full(int(np.prod(self._blocks.shape)), -1, dtype=np.int32)
         self._answers = np.zeros((len(self.tables), 0), dtype=np.uint8)
+        self._may_refuse = np.zeros((len(self.tables), 0), dtype=bool)
 
     def blocks_of(self, places: Float[np.ndarray, "3 n"]) -> Int[np.ndarray, " n"]:
         """(N,) the block of each place (3 N), world metres: a number for `may_refuse` and `may_be_blind`."""
@@ -46,14 +47,14 @@ class Culling:
             name *= shape[axis]
             name += place.astype(np.intp)
         number = self._number.take(name)
-        if (new := name[number < 0]).size:
-            self._ask(np.unique(new))
+        if number.size and number.min() < 0:
+            self._ask(np.unique(name[number < 0]))
             number = self._number.take(name)
         return number
 
     def may_refuse(self, table_idx: int, blocks: Int[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
         """Which (M,) of the blocks (N,) this camera may see outside, in part at least."""
-        return np.flatnonzero((self._answers[table_idx] & OUTSIDE).take(blocks))
+        return np.flatnonzero(self._may_refuse[table_idx].take(blocks))
 
     def evidence(
         self, table_idx: int, blocks: Int[np.ndarray, " n"]
@@ -74,3 +75,4 @@ class Culling:
         centres = self._blocks.centres(cells)
         answers = np.stack([table.ask_cells(centres, self._half_m) for table in self.tables])
         self._answers = np.concatenate([self._answers, answers], axis=1)
+        self._may_refuse = self._answers & OUTSIDE != 0

@@ -15,8 +15,9 @@ from hull.carve import carve
 from hull.cleaning import face_pieces, piece_volumes
 from hull.diagnosis import why_empty
 from hull.errors import HullError
+from hull.marching import binary_surface
 from hull.rays import RayScene
-from hull.surface import binary_surface, cross_exactly
+from hull.surface import cross_exactly
 from hull.tables import UNKNOWN, prepare_tables
 from hull.visual_hull import Hull, grid_over
 from hull.witnesses import witness_rule

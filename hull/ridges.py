@@ -37,14 +37,14 @@ def raise_ridges(
     # On a closed surface every edge runs once in each direction: the rising ones name each edge once.
     a, b = start[start < end], end[start < end]
     columns, outward = np.ascontiguousarray(vertices.T), np.ascontiguousarray(normals.T)
-    way = outward[:, a] + outward[:, b]
+    way = outward.take(a, axis=1) + outward.take(b, axis=1)
     length = np.sqrt((way**2).sum(axis=0))
     way *= voxel_m / np.maximum(length, 1e-30)
-    middle = 0.5 * (columns[:, a] + columns[:, b])
+    middle = 0.5 * (columns.take(a, axis=1) + columns.take(b, axis=1))
     places = middle + _DEPTH_SPLIT * way
     deep = np.flatnonzero(length > 0.5)
     deep = _still_inside(tables, places, deep, cut_by[a], cut_by[b], culling)
-    middle, way = middle[:, deep], _FARTHEST * way[:, deep]
+    middle, way = middle.take(deep, axis=1), _FARTHEST * way.take(deep, axis=1)
     exit_at, new_cut_by = exits(tables, middle, way, culling)
     ends = new_cut_by >= 0
     deep = deep[ends]
@@ -85,10 +85,10 @@ def _still_inside(
         kept = [chosen[: limits[0]]]
         for table_idx, table in enumerate(tables):
             asked = chosen[limits[table_idx] : limits[table_idx + 1]]
-            kept.append(asked[table.ask_points(places[:, asked]) != OUTSIDE])
+            kept.append(asked[table.ask_points(places.take(asked, axis=1)) != OUTSIDE])
         chosen = np.concatenate(kept)
     chosen = np.sort(chosen)
-    places = places[:, chosen]
+    places = places.take(chosen, axis=1)
     blocks = None if culling is None else culling.blocks_of(places)
     inside = np.ones(len(chosen), dtype=bool)
     for table_idx, table in enumerate(tables):
@@ -97,7 +97,7 @@ def _still_inside(
         else:
             asked = culling.may_refuse(table_idx, blocks)
             asked = asked[inside[asked]]
-        inside[asked[table.ask_points(places[:, asked]) == OUTSIDE]] = False
+        inside[asked[table.ask_points(places.take(asked, axis=1)) == OUTSIDE]] = False
     return chosen[inside]
 
 

@@ -19,8 +19,9 @@ from hull.cleaning import is_closed, keep_what_matters, vertex_normals
 from hull.culling import Culling
 from hull.diagnosis import why_empty
 from hull.errors import HullError
+from hull.marching import binary_surface
 from hull.ridges import raise_ridges
-from hull.surface import binary_surface, cross_exactly
+from hull.surface import cross_exactly
 from hull.tables import prepare_tables
 from hull.vertex_facts import vertex_facts
 from hull.witnesses import witness_rule

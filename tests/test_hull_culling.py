@@ -11,8 +11,9 @@ from hull.bounds import bounds_from_tables
 from hull.carve import carve
 from hull.cleaning import is_closed, vertex_normals
 from hull.culling import Culling
+from hull.marching import binary_surface
 from hull.ridges import raise_ridges
-from hull.surface import binary_surface, cross_exactly
+from hull.surface import cross_exactly
 from hull.tables import NO_EVIDENCE, OUTSIDE, UNKNOWN, SilhouetteTable, prepare_tables
 from hull.visual_hull import grid_over
 from hull.witnesses import witness_rule

@@ -1,14 +1,15 @@
-"""Whatever the voxels, the surface is closed, oriented and the same in one piece or in slabs."""
+"""Whatever the voxels, the surface is closed, oriented and the one of marching cubes on the dense volume."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from skimage.measure import marching_cubes
 
 from hull.carve import Blocks, Grid
 from hull.cleaning import compacted, face_pieces, is_closed, piece_volumes, vertex_normals
+from hull.marching import binary_surface
 from hull.ridges import split_faces
-from hull.surface import binary_surface
 
 
 def _noise(fill: float, seed: int) -> Blocks:
@@ -34,20 +35,35 @@ def test_closed_and_oriented_for_any_voxels(fill: float) -> None:
         assert (np.abs(surface.inner - surface.outer).sum(axis=1) == 1).all()
 
 
-def test_slabs_join_exactly() -> None:
-    blocks = _noise(0.4, 0)
-    whole, slabs = binary_surface(blocks), binary_surface(blocks, slab_voxels=3 * 26 * 26)
-    assert is_closed(slabs.faces, len(slabs.inner))
+@pytest.mark.parametrize("fill", [0.02, 0.4, 0.9])
+def test_the_triangles_are_those_of_marching_cubes_on_the_dense_volume(fill: float) -> None:
+    """Also where bricks are full, and where the hull reaches the grid's end."""
+    random = np.random.default_rng(1)
+    grid = Grid(np.zeros(3), 1.0, (40, 40, 24))
+    places = np.stack(np.unravel_index(random.permutation(3 * 5 * 5)[:30], (5, 5, 3)))
+    taken = np.zeros((5, 5, 3), dtype=bool)
+    taken[tuple(places)] = True
+    voxels = np.stack(np.nonzero(random.random(grid.shape) < fill))
+    voxels = voxels[:, ~taken[tuple(voxels // 8)]]
+    nothing = np.zeros((3, 0), dtype=int)
+    blocks = Blocks(grid, (voxels, nothing, nothing, places))
+    found = binary_surface(blocks)
+    low, high = np.full(3, -1), np.array(grid.shape) + 1
+    vertices, faces, _, _ = marching_cubes(
+        blocks.dense(low, high).astype(np.float32), 0.4, gradient_direction="ascent"
+    )
+    doubled = (
+        np.round(2 * np.where(np.abs(vertices % 1) > 1e-3, np.floor(vertices) + 0.5, vertices)) + 2 * low
+    )
+    assert _triangles(found.inner + found.outer, found.faces) == _triangles(doubled.astype(int), faces)
 
-    def triangles(surface) -> set:
-        middle = surface.inner + surface.outer
-        rows = middle[surface.faces]
-        # A face may start at any of its corners.
-        start = np.lexsort((rows[..., 2], rows[..., 1], rows[..., 0]), axis=1)[:, :1]
-        turned = np.take_along_axis(rows, ((start + np.arange(3)) % 3)[..., None], axis=1)
-        return {tuple(row) for row in turned.reshape(-1, 9).tolist()}
 
-    assert triangles(whole) == triangles(slabs)
+def _triangles(vertices: np.ndarray, faces: np.ndarray) -> set:
+    rows = vertices[faces]
+    # A face may start at any of its corners.
+    start = np.lexsort((rows[..., 2], rows[..., 1], rows[..., 0]), axis=1)[:, :1]
+    turned = np.take_along_axis(rows, ((start + np.arange(3)) % 3)[..., None], axis=1)
+    return {tuple(row) for row in turned.reshape(-1, 9).tolist()}
 
 
 def test_dense_voxels_are_those_of_the_blocks() -> None:
