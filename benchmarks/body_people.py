@@ -1,24 +1,29 @@
 """How near the body model comes to naked people of another model: pose and shape only, no free-form template.
 
-    python -m benchmarks.body_people FOLDER [--body free:neutral] [--components 10 16 64]
+    python -m benchmarks.body_people FOLDER [--body free:neutral] [--components 10 16 64] [--freeform]
 
 FOLDER holds one truth file a sequence (`fit.truth`: vertices (T V 3), faces, region, outer; z up), as
 `bodyhull synth` and the evaluation use them. One set of shape coefficients fits all frames of a
 sequence, with a pose a frame, by least squares from the true vertices to the model's surface. Printed: RMS
 and bias over outer vertices of torso, arms, legs and neck (mm, weighted by area), by region, and the largest
 coefficient.
+
+--freeform adds what the skinning alone leaves (`benchmarks.body_freeform`): one free template for all frames
+of a person (the sequences whose names begin alike, up to the first underscore), and the same on the half of
+the frames that the template was not fitted to.
 """
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import cho_factor, cho_solve
 
+from benchmarks.body_freeform import FreeForm, Points, fit_freeform, on_unseen_frames
 from benchmarks.hull import machine
 from fit.body.model import BodyModel, load_body
 from fit.body.pose_prior import PosePrior
@@ -147,8 +152,13 @@ def surfaces(model: BodyModel, fitted: Fitted) -> list[Surface]:
 
 def errors_by_region(model: BodyModel, truth: Truth, fitted: Fitted) -> dict[str, tuple[float, float]]:
     """RMS and bias in mm of all scored vertices ('all') and of each region, over all frames."""
+    return errors_of(truth, surfaces(model, fitted))
+
+
+def errors_of(truth: Truth, found: list[Surface]) -> dict[str, tuple[float, float]]:
+    """The same of any surfaces, one a frame, body frame."""
     signed, areas = [], []
-    for vertices, surface in zip(in_body_frame(truth), surfaces(model, fitted), strict=True):
+    for vertices, surface in zip(in_body_frame(truth), found, strict=True):
         signed.append(signed_error_mm(vertices[truth.scored], surface))
         areas.append(vertex_areas(vertices, truth.faces)[truth.scored])
     error, area = np.stack(signed), np.stack(areas)
@@ -162,11 +172,54 @@ def errors_by_region(model: BodyModel, truth: Truth, fitted: Fitted) -> dict[str
     return rows
 
 
+def freeform_surfaces(model: BodyModel, free: FreeForm) -> list[Surface]:
+    """The free-form body of every frame, body frame."""
+    arrays = SkinningArrays.of(model)
+    return [
+        Surface(np.asarray(skin(arrays, free.template, free.joints, pose, move)), model.faces)
+        for pose, move in zip(free.poses, free.translations, strict=True)
+    ]
+
+
+def print_freeform(model: BodyModel, paths: list[Path]) -> None:
+    """What the skinning leaves, a person a line: on all its frames, and on frames the template has not
+    seen.
+    """
+    people: dict[str, list[Truth]] = {}
+    for path in paths:
+        people.setdefault(path.stem.split("_")[0], []).append(load_truth(path))
+    print("\nwhat the skinning alone leaves: one free template a person, RMS (bias) mm")
+    print(f"{'person':<16}{'frames':>11}" + "".join(f"{name:>14}" for name in ("all", *SCORED_REGIONS)))
+    for name, sequences in people.items():
+        starts = [pose for truth in sequences for pose in start_poses(model, truth)]
+        vertices = np.concatenate([truth.vertices for truth in sequences])
+        truth = replace(sequences[0], vertices=vertices, frame_ids=tuple(range(len(vertices))))
+        start = fit_person(model, truth, starts)
+        true = Points.of(in_body_frame(truth), truth.outer, truth.scored)
+        at = (start.betas, start.poses, start.translations)
+        _print_errors(
+            name, f"{len(vertices)}", truth, freeform_surfaces(model, fit_freeform(model, true, *at))
+        )
+        halves = on_unseen_frames(model, true, *at)
+        if halves is None:
+            print(f"{name:<16}{'':>11}  one frame only: a free template meets it whatever the skinning does")
+            continue
+        found: list[Surface] = [Surface(np.zeros((0, 3)), model.faces)] * len(vertices)
+        found[::2], found[1::2] = (freeform_surfaces(model, half) for half in halves)
+        _print_errors(name, "not seen", truth, found)
+
+
+def _print_errors(name: str, frames: str, truth: Truth, found: list[Surface]) -> None:
+    cells = "".join(f"{rms:7.2f} {bias:+6.2f}" for rms, bias in errors_of(truth, found).values())
+    print(f"{name:<16}{frames:>11}{cells}", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("folder", type=Path, help="folder of truth files, <sequence>.npz")
     parser.add_argument("--body", default="free:neutral")
     parser.add_argument("--components", type=int, nargs="*", default=None)
+    parser.add_argument("--freeform", action="store_true", help="what the skinning alone leaves")
     options = parser.parse_args()
     model = load_body(options.body)
     counts = options.components or [10, model.n_anthropometric, model.n_betas]
@@ -174,7 +227,8 @@ def main() -> None:
     print(f"{options.body}: best fit of pose and shape to naked people of another model, RMS (bias) mm")
     header = "".join(f"{name:>14}" for name in ("all", *SCORED_REGIONS))
     print(f"{'person':<16}{'components':>11}{header}{'largest beta':>14}")
-    for path in sorted(options.folder.glob("*.npz")):
+    paths = sorted(options.folder.glob("*.npz"))
+    for path in paths:
         truth = load_truth(path)
         starts = start_poses(model, truth)
         for n in counts:
@@ -183,6 +237,8 @@ def main() -> None:
             rows = errors_by_region(part, truth, fitted)
             cells = "".join(f"{rms:7.2f} {bias:+6.2f}" for rms, bias in rows.values())
             print(f"{path.stem:<16}{n:>11}{cells}{np.abs(fitted.betas).max():14.2f}", flush=True)
+    if options.freeform:
+        print_freeform(model, paths)
 
 
 if __name__ == "__main__":

@@ -143,7 +143,7 @@ def write_run_report(config: RunConfig, recording: Recording, track: dict[str, A
     }
     everything = [v for values in scores.values() for v in values]
     hull_frames, fit_frames = stages["hull"]["frames"], stages["fit"]["frames"]
-    problems = list(recording.notes)
+    problems = [note for note in recording.notes if note not in recording.settled]
     for entry in (*hull_frames.values(), *fit_frames.values()):
         problems += [p for p in entry["problems"] if p not in problems]
     hull_scores = {
@@ -219,6 +219,7 @@ def write_run_report(config: RunConfig, recording: Recording, track: dict[str, A
             subtitle=f"{len(recording.rig)} cameras, {len(hull_frames)} frames, body {stages['fit']['body']}",
             headline=tuple(headline),
             problems=tuple(problems),
+            notes=recording.settled,
             facts=tuple(facts),
             tables=tuple(tables),
             sheet_headers=("picture", "silhouette", "hull", "body", "overlay", "agreement"),

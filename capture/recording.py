@@ -42,6 +42,7 @@ class Recording:
     unit, metres_per_unit : the calibration's own world unit.
     notes : what was found out or repaired on opening, a sentence each.
     source : where frames come from.
+    settled : those of the notes that give no reason for doubt (unit, up axis).
     """
 
     name: str
@@ -53,6 +54,7 @@ class Recording:
     metres_per_unit: float
     notes: tuple[str, ...]
     source: FrameSource
+    settled: tuple[str, ...] = ()
 
     def silhouettes(self, frame_id: int) -> Silhouettes:
         """The frame's silhouettes, undistorted, one a camera of `rig`; what could not be had is None and
@@ -210,6 +212,7 @@ def _recording(
         unit=world.unit,
         metres_per_unit=world.metres_per_unit,
         notes=(*notes, *world.notes),
+        settled=world.settled,
         source=source,
     )
 

@@ -22,17 +22,22 @@ METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 UP_AXES = dict(zip(("x", "y", "z", "-x", "-y", "-z"), [*np.eye(3), *-np.eye(3)], strict=True))
 _PERSON_M = 1.7
 
+_SURE_OF_UP_DEG = 20.0  # rigs that look down from a dome tilt their mean by less
+
 Masks = Sequence[UInt8[np.ndarray, "_h _w"] | None]
 
 
 @dataclass(frozen=True)
 class World:
-    """The world frame's unit and up axis. up (3,): unit vector. notes: how they were found."""
+    """The world frame's unit and up axis. up (3,): unit vector. notes: how they were found, and doubts;
+    settled: those of the notes that give no reason for doubt.
+    """
 
     unit: str
     metres_per_unit: float
     up: Float[np.ndarray, " 3"]
     notes: tuple[str, ...]
+    settled: tuple[str, ...] = ()
 
 
 def settle_world(
@@ -51,17 +56,19 @@ def settle_world(
     format or by the user. Raises RecordingError where the calibration is mirrored or inverted, or where unit
     or up axis cannot be told.
     """
-    notes: list[str] = []
+    doubts: list[str] = []
+    settled: list[str] = []
     subject, miss = find_subject(rig, masks)
     _check_facing(rig, masks, subject, miss, where)
     distance = float(np.median(np.linalg.norm(rig.centres - subject, axis=1)))
     if masks is not None and miss > 0.08 * distance:
-        notes.append(
+        doubts.append(
             "The rays through the silhouettes' middles miss each other by "
             f"{100 * miss / distance:.0f} % of the distance: does the calibration belong to these folders?"
         )
-    unit = _settle_unit(rig, masks, subject, declared_unit, units, where, notes)
-    return World(unit, METRES_PER_UNIT[unit], _settle_up(rig, up, notes), tuple(notes))
+    unit = _settle_unit(rig, masks, subject, declared_unit, units, where, doubts, settled)
+    axis = _settle_up(rig, up, doubts, settled)
+    return World(unit, METRES_PER_UNIT[unit], axis, (*doubts, *settled), tuple(settled))
 
 
 def find_subject(rig: Rig, masks: Masks | None) -> tuple[Float[np.ndarray, " 3"], float]:
@@ -178,7 +185,8 @@ def _settle_unit(
     declared: str | None,
     units: str,
     where: str,
-    notes: list[str],
+    doubts: list[str],
+    settled: list[str],
 ) -> str:
     if units != "auto" and units not in METRES_PER_UNIT:
         raise RecordingError(f"--units {units}: unknown; choose auto, m, cm or mm")
@@ -193,19 +201,19 @@ def _settle_unit(
                 f"{where}: the subject is {size:.3g} units tall, which is no person in m, cm or mm; "
                 "check the calibration or give --units"
             )
-        notes.append(f"Unit of the calibration: {unit} (the subject then spans {tall:.2f} m).")
+        settled.append(f"Unit of the calibration: {unit} (the subject then spans {tall:.2f} m).")
         return unit
     unit = declared if units == "auto" and declared is not None else units
     if size is not None and not 0.6 < size * METRES_PER_UNIT[unit] < 3.5:
         span = size * METRES_PER_UNIT[unit]
-        notes.append(f"With the unit {unit} the subject spans {span:.3g} m, which is no person.")
+        doubts.append(f"With the unit {unit} the subject spans {span:.3g} m, which is no person.")
     distance = float(np.median(np.linalg.norm(rig.centres - subject, axis=1))) * METRES_PER_UNIT[unit]
     if not 0.3 < distance < 60:
-        notes.append(
+        doubts.append(
             f"With the unit {unit} the cameras stand {distance:.3g} m from the subject: check the unit."
         )
     if declared is not None and unit != declared:
-        notes.append(f"Unit {unit} as asked; the calibration's format says {declared}.")
+        settled.append(f"Unit {unit} as asked; the calibration's format says {declared}.")
     return unit
 
 
@@ -235,7 +243,7 @@ def subject_extent(rig: Rig, masks: Masks, subject: Float[np.ndarray, " 3"]) -> 
     return float(np.median(whole or cut)) if whole or cut else None
 
 
-def _settle_up(rig: Rig, up: str, notes: list[str]) -> Float[np.ndarray, " 3"]:
+def _settle_up(rig: Rig, up: str, doubts: list[str], settled: list[str]) -> Float[np.ndarray, " 3"]:
     if up != "auto":
         if up not in UP_AXES:
             raise RecordingError(f"--up {up}: unknown; choose auto or one of {', '.join(UP_AXES)}")
@@ -250,5 +258,6 @@ def _settle_up(rig: Rig, up: str, notes: list[str]) -> Float[np.ndarray, " 3"]:
             "say which one it is with --up x|y|z|-x|-y|-z"
         )
     off_deg = np.degrees(np.arccos(min(cosine, 1.0)))
-    notes.append(f"Up axis: {name} (the cameras' mean up direction is {off_deg:.0f} degrees off it).")
+    note = f"Up axis: {name} (the cameras' mean up direction is {off_deg:.0f} degrees off it)."
+    (settled if off_deg < _SURE_OF_UP_DEG else doubts).append(note)
     return UP_AXES[name].copy()

@@ -85,6 +85,9 @@ def meeting_point(tables: Sequence[SilhouetteTable]) -> Float[np.ndarray, " 3"]:
         if (ray := _central_ray(table)) is not None:
             origins.append(table.centre)
             directions.append(ray)
+    if len(tables) < 2:
+        which = f"only camera {tables[0].name}" if tables else "no camera"
+        raise HullError(f"{which} gave a silhouette that could be read; a hull needs at least 2")
     if len(origins) < 2:
         empty = [table.name for table in tables if _central_ray(table) is None]
         which = f" (empty: {', '.join(empty)})" if empty else ""

@@ -62,7 +62,8 @@ class ReportData:
     title; subtitle: a sentence; headline: the few (name, value) that matter most, shown large; problems: a
     sentence each, what went wrong or was found odd (empty: the page says so); facts: (name, value) of the
     run; pictures: wide ones, one under the other; tables; sheet_headers and sheet: the contact sheet; films:
-    (caption, path relative to the report's folder) of MP4 files.
+    (caption, path relative to the report's folder) of MP4 files; notes: a sentence each, what was settled
+    without a doubt.
     """
 
     title: str
@@ -76,6 +77,7 @@ class ReportData:
     sheet: tuple[Row, ...] = ()
     films: tuple[tuple[str, str], ...] = ()
     footer: str = field(default="")
+    notes: tuple[str, ...] = ()
 
 
 def write_report(path: Path | str, data: ReportData, *, image_px: int = 420) -> Path:

@@ -29,7 +29,8 @@ def test_the_unit_is_recognised_and_removed(tmp_path, unit, metres):
         pixels, depth = found.project(PERSON[:, :3].copy())
         expected, expected_depth = given.project(PERSON[:, :3].copy())
         assert np.allclose(pixels, expected, atol=1e-8) and np.allclose(depth, expected_depth)
-    assert any(f"Unit of the calibration: {unit}" in note for note in recording.notes)
+    assert any(f"Unit of the calibration: {unit}" in note for note in recording.settled)
+    assert set(recording.settled) <= set(recording.notes)
 
 
 @pytest.mark.parametrize("axis", list(UP_AXES))
@@ -43,6 +44,7 @@ def test_what_the_user_says_goes_before_what_is_seen(tmp_path):
     recording = open_recording(root, units="mm", up="-y")
     assert recording.unit == "mm" and np.array_equal(recording.up, [0, -1, 0])
     assert any("which is no person" in note for note in recording.notes)
+    assert not recording.settled, "a doubt was taken for settled"
     with pytest.raises(RecordingError, match="--units inch: unknown; choose auto, m, cm or mm"):
         open_recording(root, units="inch")
     with pytest.raises(RecordingError, match="--up w: unknown; choose auto or one of x, y, z, -x, -y, -z"):

@@ -72,7 +72,11 @@ def test_too_few_silhouettes() -> None:
     images: list = ball().silhouettes(RIG)
     assert "8 cameras but 7 silhouettes" in _error(RIG, images[:7])
     alone = [images[0]] + [None] * 7
-    assert "1 of 1 silhouettes show anything; a hull needs at least 2" in _error(RIG, alone)
+    assert f"only camera {RIG[0].name} gave a silhouette that could be read; a hull needs" in _error(
+        RIG, alone
+    )
+    nothing = [None] * 8
+    assert "no camera gave a silhouette that could be read; a hull needs at least 2" in _error(RIG, nothing)
     blank = [np.zeros_like(image) for image in images]
     assert f"0 of 8 silhouettes show anything (empty: {RIG[0].name}, " in _error(RIG, blank)
     assert "a hull needs at least 2, and 3 or more to be of use" in _error(RIG, alone, 0.02, BOX)

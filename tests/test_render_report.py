@@ -20,6 +20,7 @@ def example() -> ReportData:
         subtitle="16 cameras & 12 frames",
         headline=(("RMS", "3.2 mm"),),
         problems=("cam-003, frame 000004: the silhouette is empty",),
+        notes=("Up axis: z",),
         facts=(("body", "free:female"),),
         tables=(
             Table(
@@ -41,6 +42,15 @@ def test_everything_is_in_the_one_file(tmp_path: Path) -> None:
     for said in ("3.2 mm", "frame 000004: the silhouette is empty", "free:female", "in mm", "IoU 0.9"):
         assert said in page
     assert page.count('src="data:image/') == 3
+
+
+def test_what_is_settled_is_no_problem(tmp_path: Path) -> None:
+    page = write_report(tmp_path / "r.html", example()).read_text(encoding="utf-8")
+    problems = page.split('<ul class="problems">')[1].split("</ul>")[0]
+    notes = page.split('<ul class="notes">')[1].split("</ul>")[0]
+    assert "Up axis: z" in notes and "Up axis: z" not in problems
+    bare = write_report(tmp_path / "b.html", ReportData("t", notes=("a note",))).read_text(encoding="utf-8")
+    assert "No problems were found." in bare and "a note" in bare
 
 
 def test_text_is_escaped(tmp_path: Path) -> None:
