@@ -6,13 +6,12 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
-
 from bodyhull.folder import write_atomically
 from bodyhull.study import Outcome, StudySubject
 from bodyhull.study_plan import Case, StudyPlan
 from render.report import Image, ReportData, Table, write_report
 from render.study_plot import Curve, Panel, draw_panels
+from render.turntable import png_bytes
 
 HEADERS = (
     "cameras", "width px", "calibration px", "mask px", "mm a pixel", "hull bias", "hull RMS", "hull 95 %",
@@ -95,7 +94,7 @@ def write_study(
     table = f"{markdown(outcomes)}\n{PROTOCOL}\n"
     write_atomically(out / "table.md", lambda path: path.write_text(table))
     plot = draw_panels(panels_of(plan, outcomes), "millimetres")
-    _write_png(out / "plot.png", plot)
+    write_atomically(out / "plot.png", lambda path: path.write_bytes(png_bytes(plot)))
     rig = plan.layout if plan.calibration is None else plan.calibration.name
     write_report(
         out / "index.html",
@@ -108,11 +107,3 @@ def write_study(
             tables=(Table("Every rig", HEADERS, tuple(table_rows(outcomes)), PROTOCOL),),
         ),
     )
-
-
-def _write_png(path: Path, pixels: np.ndarray) -> None:
-    import cv2
-
-    done, data = cv2.imencode(".png", np.ascontiguousarray(pixels[:, :, ::-1]))
-    assert done
-    write_atomically(path, lambda part: part.write_bytes(data.tobytes()))

@@ -23,11 +23,11 @@ LIBRARIES = {
     "capture": {"cv2", "pycolmap"},
     "hull": {"cv2", "skimage", "open3d"},
     "fit": {"jax", "skimage", "open3d", "threadpoolctl", "platformdirs", "body_models"},
-    "render": {"cv2", "open3d", "pyrender", "OpenGL", "av", "jinja2"},
+    "render": {"cv2", "open3d", "pyrender", "OpenGL", "av", "jinja2", "matplotlib"},
     "bodyhull": {"tyro", "jax", "av"},
 }
 #: Only imported inside functions: they start something, or take seconds.
-LAZY = {"pyrender", "OpenGL", "open3d", "av", "body_models"}
+LAZY = {"pyrender", "OpenGL", "open3d", "av", "body_models", "matplotlib"}
 MODULES = sorted(path for room in MAY_IMPORT for path in (ROOT / room).rglob("*.py"))
 
 
