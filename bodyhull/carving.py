@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import sys
 import time
+from collections import Counter
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
@@ -18,11 +19,13 @@ from bodyhull.errors import UserError
 from bodyhull.folder import RunFolder, write_atomically
 from capture.recording import Recording, open_recording
 from hull.errors import HullError
+from hull.faults import CameraFault
 from hull.hull_file import facts_file, load_hull, save_hull
 from hull.mesh_file import MeshFileError
 from hull.quality import silhouette_agreement
 from hull.visual_hull import build_hull
 
+OFTEN_SHARE = 1 / 3
 AGAIN = "run with --overwrite to redo it, or choose another --out"
 NOTED_PACKAGES = (
     "numpy",
@@ -38,13 +41,15 @@ NOTED_PACKAGES = (
 
 @dataclass(frozen=True)
 class CarvedFrame:
-    """What is known of a frame's hull: status "ok", "degraded" (a camera gave no evidence) or "failed"."""
+    """What is known of a frame's hull: status "ok", "degraded" (a camera gave no evidence, or contradicts the
+    others) or "failed"."""
 
     frame_id: int
     status: str
     problems: tuple[str, ...]
     agreement: tuple[float | None, ...] = ()
     volume_m3: float | None = None
+    faults: tuple[CameraFault, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-ready."""
@@ -53,6 +58,7 @@ class CarvedFrame:
             "problems": list(self.problems),
             "agreement": list(self.agreement),
             "volume_m3": self.volume_m3,
+            "faults": [fault.as_dict() for fault in self.faults],
         }
 
 
@@ -162,11 +168,25 @@ def carve_stage(config: RunConfig) -> Recording:
         folder.update_stage(
             "hull", seconds=round(time.perf_counter() - started, 2), carved=len(todo), frames=frames
         )
+    for sentence in often_at_fault(frames):
+        tqdm.write(f"warning: {sentence}", file=sys.stderr)
     failed = [k for k in recording.frame_ids if frames[f"{k:06d}"]["status"] == "failed"]
     if len(failed) == len(recording.frame_ids):
         first = frames[f"{failed[0]:06d}"]["problems"]
         raise UserError(f"no frame of {config.recording} could be carved; frame {failed[0]:06d}: {first[0]}")
     return recording
+
+
+def often_at_fault(frames: dict[str, Any]) -> list[str]:
+    """A sentence for each camera that is at fault in a third of the frames (of run.json) or more: then it is
+    the camera, and not the segmentation of a frame."""
+    carved = [entry for entry in frames.values() if entry["status"] != "failed"]
+    counts = Counter(fault["camera"] for entry in carved for fault in entry.get("faults", []))
+    return [
+        f"camera {name} contradicts the others in {n} of {len(carved)} frames; look at its calibration"
+        for name, n in sorted(counts.items())
+        if n >= max(2, OFTEN_SHARE * len(carved))
+    ]
 
 
 def _carved(folder: RunFolder, frame_id: int, known: dict[str, Any]) -> bool:
@@ -195,6 +215,8 @@ def carve_frame(recording: Recording, folder: RunFolder, frame_id: int, voxel_mm
         folder.hull(frame_id).unlink(missing_ok=True)
         facts_file(folder.hull(frame_id)).unlink(missing_ok=True)
         return CarvedFrame(frame_id, "failed", (*silhouettes.problems, message))
+    for fault in hull.faults:
+        tqdm.write(f"warning: frame {frame_id:06d}: {fault.sentence()}", file=sys.stderr)
     agreement = silhouette_agreement(hull.vertices, hull.faces, recording.rig, silhouettes.images)
     path = folder.hull(frame_id)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -202,8 +224,9 @@ def carve_frame(recording: Recording, folder: RunFolder, frame_id: int, voxel_mm
     problems = (*silhouettes.problems, *hull.problems)
     return CarvedFrame(
         frame_id,
-        "degraded" if silhouettes.problems else "ok",
+        "degraded" if silhouettes.problems or hull.faults else "ok",
         problems,
         tuple(None if np.isnan(v) else round(float(v), 5) for v in agreement),
         round(hull.volume_m3, 6),
+        hull.faults,
     )

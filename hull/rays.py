@@ -81,6 +81,13 @@ class RayScene:
         rays = _as_tensor(self._rays(starts, ways))
         return self._scene.count_intersections(rays, nthreads=self._n_threads).numpy().astype(np.int64)
 
+    def meets(
+        self, origins: Float[np.ndarray, "n 3"], ways: Float[np.ndarray, "n 3"]
+    ) -> Bool[np.ndarray, " n"]:
+        """(N,) whether the half line from each origin (N 3) along its way (N 3) meets the surface."""
+        rays = _as_tensor(self._rays(origins, ways))
+        return self._scene.test_occlusions(rays, nthreads=self._n_threads).numpy()
+
     def signed_distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """(N,) metres from the surface, negative inside, to about a micrometre."""
         query = _as_tensor((points - self._middle).astype(np.float32))

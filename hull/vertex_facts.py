@@ -32,13 +32,15 @@ def vertex_facts(
     normals: Float[np.ndarray, "v 3"],
     cut_by: Int[np.ndarray, " v"],
     culling: Culling,
+    scene: RayScene,
 ) -> VertexFacts:
-    """The facts of a finished hull (closed, outward normals, metres). `cut_by` (V,): table or -1."""
+    """The facts of a finished hull (closed, outward normals, metres). `cut_by` (V,): table or -1.
+
+    `scene`: of the same vertices and faces.
+    """
     tables = culling.tables
     camera_idx = np.array([table.camera_idx for table in tables] + [-1])
     outlines = outlines_at(vertices, culling)
-    # One thread: frames are what runs in parallel.
-    scene = RayScene(vertices, faces, n_threads=1)
     slack_m = spread_to_neighbours(slack_at(vertices, normals, scene, outlines, tables), faces)
     return VertexFacts(
         n_witnesses=outlines.n_witnesses,

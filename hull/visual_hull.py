@@ -18,15 +18,29 @@ from hull.carve import Grid, carve
 from hull.cleaning import is_closed, keep_what_matters, vertex_normals
 from hull.culling import Culling
 from hull.diagnosis import why_empty
-from hull.errors import HullError
+from hull.errors import EmptyHullError, HullError
+from hull.faults import CameraFault, Carved, settle
 from hull.marching import binary_surface
+from hull.rays import RayScene
 from hull.ridges import raise_ridges
 from hull.surface import cross_exactly
-from hull.tables import prepare_tables
+from hull.tables import SilhouetteTable, prepare_tables
 from hull.vertex_facts import vertex_facts
-from hull.witnesses import witness_rule
+from hull.witnesses import WitnessRule, witness_rule
 
-__all__ = ["Hull", "HullError", "build_hull"]
+__all__ = ["Hull", "HullError", "HullOptions", "build_hull"]
+
+
+@dataclass(frozen=True)
+class HullOptions:
+    """Everything that is a choice.
+
+    Fields
+    ------
+    find_faults : cameras whose silhouette contradicts the others are named and kept from cutting the hull.
+    """
+
+    find_faults: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +62,7 @@ class Hull:
     is_phantom : (V,), true on parts that no silhouette needs.
     colours : (V 3) RGB from the pictures, or None.
     problems : one sentence each about what had to be left out or decided.
+    faults : cameras whose silhouette contradicts the others, and what was done about each.
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -60,6 +75,7 @@ class Hull:
     is_phantom: Bool[np.ndarray, " v"]
     colours: UInt8[np.ndarray, "v 3"] | None = None
     problems: tuple[str, ...] = ()
+    faults: tuple[CameraFault, ...] = ()
 
     @staticmethod
     def of_mesh(
@@ -91,6 +107,7 @@ def build_hull(
     images: Sequence[np.ndarray | None],
     voxel_m: float = 0.008,
     bounds: Bounds | None = None,
+    options: HullOptions = HullOptions(),
 ) -> Hull:
     """The visual hull of one frame.
 
@@ -98,20 +115,45 @@ def build_hull(
     images : per camera (h w) uint8 (255 person, 0 background, 128 unknown) or None (no evidence).
     voxel_m : grid pitch. The surface is about four times as accurate; thinner parts than this may be lost.
     bounds : where to look; found from the silhouettes if None.
+    options : everything else that is a choice.
 
     Raises HullError: fewer than two silhouettes, a silhouette of another size than its camera's, or an empty
     hull, naming the cameras at fault.
     """
     if not voxel_m > 0:
         raise HullError(f"voxel_m is {voxel_m}; it must be a positive length in metres, such as 0.008")
-    tables = prepare_tables(rig, images)
-    if bounds is None:
-        bounds = bounds_from_tables(tables)
+    cameras = tuple(rig)
+
+    def carve_with(tables: Sequence[SilhouetteTable], rule: WitnessRule, box: Bounds) -> Carved:
+        return _surface(tables, rule, box, voxel_m)
+
+    faults: tuple[CameraFault, ...] = ()
+    if options.find_faults:
+        settled = settle(cameras, images, bounds, carve_with)
+        carved, faults = settled.carved, settled.faults
+    else:
+        tables = prepare_tables(cameras, images)
+        box = bounds if bounds is not None else bounds_from_tables(tables)
+        carved = carve_with(tables, witness_rule(tables, box.centre), box)
+    normals = vertex_normals(carved.vertices, carved.faces)
+    return Hull(
+        vertices=carved.vertices,
+        faces=carved.faces,
+        normals=normals,
+        **vars(
+            vertex_facts(carved.vertices, carved.faces, normals, carved.cut_by, carved.culling, carved.scene)
+        ),
+        problems=(*carved.problems, *(fault.sentence() for fault in faults)),
+        faults=faults,
+    )
+
+
+def _surface(tables: Sequence[SilhouetteTable], rule: WitnessRule, bounds: Bounds, voxel_m: float) -> Carved:
+    """The closed surface of these tables' hull. Raises HullError where it is empty."""
     grid = grid_over(bounds, voxel_m)
-    rule = witness_rule(tables, bounds.centre)
     blocks = carve(tables, rule, grid)
     if not blocks.n_voxels:
-        raise HullError(why_empty(tables, rule, bounds.low, bounds.high))
+        raise EmptyHullError(why_empty(tables, rule, bounds.low, bounds.high))
     surface = binary_surface(blocks)
     culling = Culling(tables, grid)
     crossings = cross_exactly(surface, grid, tables, culling)
@@ -126,14 +168,9 @@ def build_hull(
     kept, faces, problems = keep_what_matters(crossings.vertices, faces, tables)
     vertices, cut_by = crossings.vertices[kept], crossings.cut_by[kept]
     assert is_closed(faces, len(vertices)), "the hull's surface is not closed"
-    normals = vertex_normals(vertices, faces)
-    return Hull(
-        vertices=vertices,
-        faces=faces,
-        normals=normals,
-        **vars(vertex_facts(vertices, faces, normals, cut_by, culling)),
-        problems=problems + _touching(blocks.span(), grid),
-    )
+    # One thread: frames are what runs in parallel.
+    scene = RayScene(vertices, faces, n_threads=1)
+    return Carved(vertices, faces, cut_by, problems + _touching(blocks.span(), grid), culling, scene)
 
 
 def grid_over(bounds: Bounds, voxel_m: float) -> Grid:

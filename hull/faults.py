@@ -1,0 +1,281 @@
+"""Cameras whose silhouette contradicts the others in one frame: found, named, and kept from cutting the hull.
+
+A hull is an intersection, so one silhouette that lacks a leg takes the leg from everybody. Here every
+silhouette must be explained by the hull (`hull.evidence`); a camera that stands against many lines of sight
+of the others is left out, the frame is carved again without it, and its silhouette is compared with that
+better hull: in a small rig, if a part is missing and the rest fits, only that region is made unknown and
+the camera comes back; else it stays out. At most a quarter of the cameras is treated so, and never without a
+word.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from capture.camera import Camera
+from hull.bounds import Bounds, bounds_from_tables, meeting_point
+from hull.culling import Culling
+from hull.errors import EmptyHullError, HullError
+from hull.evidence import MissedLines, missed_lines
+from hull.fault_kinds import CameraFault, FaultAction, FaultKind, classified, kept_against, shows_too_much
+from hull.holes import false_holes
+from hull.rays import RayScene
+from hull.tables import INSIDE, NO_EVIDENCE, SilhouetteTable, prepare_table, prepare_tables
+from hull.witnesses import WitnessRule, witness_rule
+
+# With fewer cameras than this none can be spared: they are told of, not left out.
+FEWEST_TO_JUDGE = 6
+LARGEST_SHARE_OUT = 0.25
+# With this many cameras a silhouette that lacks a part is not worth mending: the others leave no gap.
+MENDED_BELOW = 24
+# A camera is at fault when it forbids this share of the others' lines and so many times the typical camera's
+# share, or this share deeply (far from its outline); two of the others at least must have such lines.
+_SHARE, _FACTOR, _DEEP_SHARE, _N_ACCUSERS = 0.01, 5.0, 0.001, 2
+# A camera shows too much when two others refuse this share of its lines, and so many times the typical share.
+_SURPLUS_SHARE = 0.1
+_MOST_ROUNDS = 8
+# If the hull explains so little, it may lie in the wrong place; nobody is larger than this around the middle.
+_MOSTLY_MISSED, _PERSON_M = 0.3, 1.3
+
+
+@dataclass(frozen=True, eq=False)
+class Carved:
+    """A frame's surface before it is described.
+
+    Fields
+    ------
+    vertices (V 3), faces (F 3) : closed, world metres.
+    cut_by : (V,) the table on whose cone a vertex lies, or -1.
+    problems : a sentence each.
+    culling : of the tables it was carved with.
+    scene : the surface, ready for rays.
+    """
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    cut_by: Int[np.ndarray, " v"]
+    problems: tuple[str, ...]
+    culling: Culling
+    scene: RayScene
+
+
+CarveWith = Callable[[Sequence[SilhouetteTable], WitnessRule, Bounds], Carved]
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """A surface that the silhouettes agree on, and what had to be done for it.
+
+    Fields
+    ------
+    carved : what `carve_with` made of `tables`.
+    tables, rule, bounds : of the cameras that are left, some with unknown regions.
+    n_lines (C,), missed : how the lines of sight of these tables fare with this surface.
+    faults : one for each camera that contradicts the others, in the rig's order.
+    """
+
+    carved: Carved
+    tables: tuple[SilhouetteTable, ...]
+    rule: WitnessRule
+    bounds: Bounds
+    n_lines: Int[np.ndarray, " c"]
+    missed: MissedLines
+    faults: tuple[CameraFault, ...]
+
+
+@dataclass
+class _Cameras:
+    """Who takes part. Cameras are counted as in the rig; `images` are the present ones, regions unknown."""
+
+    rig: tuple[Camera, ...]
+    images: list[UInt8[np.ndarray, "_h _w"] | None]
+    tables: dict[int, SilhouetteTable]
+    out: set[int] = field(default_factory=set)
+    unjudged: set[int] = field(default_factory=set)
+    faults: dict[int, CameraFault] = field(default_factory=dict)
+
+    def present(self) -> tuple[SilhouetteTable, ...]:
+        return tuple(table for idx, table in self.tables.items() if idx not in self.out)
+
+    def room(self) -> int:
+        """How many more may be found at fault."""
+        n = len(self.tables)
+        if n < FEWEST_TO_JUDGE:
+            return 0
+        return max(int(LARGEST_SHARE_OUT * n) - len(self.out | set(self.faults)), 0)
+
+
+def settle(
+    rig: Sequence[Camera],
+    images: Sequence[UInt8[np.ndarray, "_h _w"] | None],
+    bounds: Bounds | None,
+    carve_with: CarveWith,
+) -> Settled:
+    """Carve, look for contradictions, carve again without the cameras at fault, until the rest agrees.
+
+    `carve_with` makes the surface of some tables and raises EmptyHullError where nothing is left. That is
+    raised where nothing is left whatever few cameras are left out.
+    """
+    cameras = _Cameras(
+        tuple(rig), list(images), {table.camera_idx: table for table in prepare_tables(rig, images)}
+    )
+    for _ in range(_MOST_ROUNDS):
+        box = bounds if bounds is not None else _bounds_without_blank(cameras)
+        tables = cameras.present()
+        rule = witness_rule(tables, box.centre)
+        carved, error = None, None
+        try:
+            carved = carve_with(tables, rule, box)
+        except EmptyHullError as empty:
+            error = empty
+        scene = None if carved is None else carved.scene
+        n_lines, missed = missed_lines(tables, rule, box, scene)
+        blamed = _blamed(tables, n_lines, missed)
+        if not blamed and missed.scale * len(missed.table) > _MOSTLY_MISSED * n_lines.sum():
+            # Faults that agree with each other may have put the box anywhere.
+            n_lines, missed = missed_lines(tables, rule, _around(tables), scene)
+            blamed = _blamed(tables, n_lines, missed)
+        if carved is not None:
+            blamed += [k for k in false_holes(tables, box) if k not in blamed]
+        room = cameras.room()
+        again = [k for k in blamed if tables[k].camera_idx in cameras.faults]
+        fresh = [k for k in blamed if tables[k].camera_idx not in cameras.faults]
+        removed = again + fresh[:room]
+        if removed:
+            # One that was mended and still contradicts stays out, with what was found of it.
+            for k in removed:
+                idx = tables[k].camera_idx
+                cameras.out.add(idx)
+                if idx in cameras.faults:
+                    cameras.faults[idx] = cameras.faults[idx].done(FaultAction.LEFT_OUT)
+                else:
+                    cameras.unjudged.add(idx)
+            continue
+        if carved is None:
+            assert error is not None
+            raise error
+        if cameras.unjudged and _judge(cameras, carved.scene):
+            continue
+        return _settled(cameras, carved, tables, rule, box, n_lines, missed, fresh)
+    raise HullError(
+        f"the silhouettes contradict one another: {_names(cameras, cameras.out)} were left out, "
+        "and the others still do not agree; look at the calibration"
+    )
+
+
+def _around(tables: Sequence[SilhouetteTable]) -> Bounds:
+    """A person's surroundings, wherever most silhouettes see one."""
+    middle = meeting_point(tables)
+    return Bounds(middle - _PERSON_M, middle + _PERSON_M)
+
+
+def _bounds_without_blank(cameras: _Cameras) -> Bounds:
+    """The box; where there is none, cameras that show nobody are left out first, as far as that may be."""
+    try:
+        return bounds_from_tables(cameras.present())
+    except HullError:
+        blank = [t.camera_idx for t in cameras.present() if _is_blank(t)]
+        if not blank or len(blank) > cameras.room():
+            raise
+        cameras.out.update(blank)
+        cameras.unjudged.update(blank)
+        return bounds_from_tables(cameras.present())
+
+
+def _is_blank(table: SilhouetteTable) -> bool:
+    return not (table.squares[0] & INSIDE).any() and not (table.squares[0] == NO_EVIDENCE).all()
+
+
+def _blamed(
+    tables: Sequence[SilhouetteTable], n_lines: Int[np.ndarray, " c"], missed: MissedLines
+) -> list[int]:
+    """Tables that forbid what others show, worst first: each explains lines that those before it leave."""
+    others = np.maximum(n_lines.sum() - n_lines, 1)
+    foreign = missed.table[:, None] != np.arange(len(tables))
+    weight = np.where(foreign, missed.suspect, 0.0) * missed.scale
+    deep = missed.deep & foreign
+    typical = float(np.median(weight.sum(axis=0) / others))
+    open_ = np.ones(len(weight), dtype=bool)
+    found: list[int] = []
+    while open_.any():
+        share = weight[open_].sum(axis=0) / others
+        deep_share = missed.scale * deep[open_].sum(axis=0) / others
+        accusers = np.array(
+            [len(np.unique(missed.table[open_ & (weight[:, k] > 0)])) for k in range(len(tables))]
+        )
+        at_fault = (share > max(_SHARE, _FACTOR * typical)) | (deep_share > max(_DEEP_SHARE, typical))
+        at_fault &= accusers >= _N_ACCUSERS
+        if not at_fault.any():
+            break
+        worst = int(np.argmax(np.where(at_fault, share, 0.0)))
+        found.append(worst)
+        # Its own lines are worth nothing now, and those that it alone forbids are explained.
+        open_ &= (missed.table != worst) & (weight[:, worst] == 0)
+    return found
+
+
+def _judge(cameras: _Cameras, scene: RayScene) -> bool:
+    """Say what is wrong with each camera left out; True where one comes back with a region unknown."""
+    returned = False
+    for idx in sorted(cameras.unjudged):
+        image = cameras.images[idx]
+        assert image is not None
+        fault, mended = classified(cameras.rig[idx], idx, image, scene)
+        cameras.faults[idx] = fault
+        if mended is not None and len(cameras.tables) < MENDED_BELOW:
+            cameras.faults[idx] = fault.done(FaultAction.REGION_UNKNOWN)
+            cameras.images[idx] = mended
+            cameras.tables[idx] = prepare_table(cameras.rig[idx], mended, idx)
+            cameras.out.discard(idx)
+            returned = True
+    cameras.unjudged.clear()
+    return returned
+
+
+def _settled(
+    cameras: _Cameras,
+    carved: Carved,
+    tables: tuple[SilhouetteTable, ...],
+    rule: WitnessRule,
+    bounds: Bounds,
+    n_lines: Int[np.ndarray, " c"],
+    missed: MissedLines,
+    unsettled: list[int],
+) -> Settled:
+    faults = dict(cameras.faults)
+    for k in unsettled:
+        share = missed.scale * missed.suspect[:, k].sum() / max(n_lines.sum(), 1)
+        faults[tables[k].camera_idx] = kept_against(tables[k], float(share))
+    too_much = _share_of_lines(missed, missed.refused, n_lines)
+    limit = max(_SURPLUS_SHARE, _FACTOR * float(np.median(too_much)))
+    for k in np.flatnonzero(too_much > limit).tolist():
+        if tables[k].camera_idx not in faults:
+            faults[tables[k].camera_idx] = shows_too_much(
+                tables[k], cameras.images[tables[k].camera_idx], float(too_much[k])
+            )
+    listed = tuple(faults[idx] for idx in sorted(faults))
+    return Settled(carved, tables, rule, bounds, n_lines, missed, listed)
+
+
+def _share_of_lines(
+    missed: MissedLines, which: Bool[np.ndarray, " m"], n_lines: Int[np.ndarray, " c"]
+) -> Float[np.ndarray, " c"]:
+    count = np.bincount(missed.table[which], minlength=len(n_lines))
+    return missed.scale * count / np.maximum(n_lines, 1)
+
+
+def _names(cameras: _Cameras, indices: set[int]) -> str:
+    return ", ".join(f"camera {cameras.rig[idx].name}" for idx in sorted(indices))
+
+
+def entries(faults: Sequence[CameraFault]) -> list[dict[str, Any]]:
+    """JSON-ready, for run.json."""
+    return [fault.as_dict() for fault in faults]
+
+
+__all__ = ["CameraFault", "FaultAction", "FaultKind", "Settled", "entries", "settle"]
