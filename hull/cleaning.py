@@ -111,10 +111,16 @@ def _crossed(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[
 
 def is_closed(faces: Int[np.ndarray, "f 3"], n_vertices: int) -> bool:
     """True if every edge is used exactly once in each direction: watertight and consistently oriented."""
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
-    forth = np.sort(ends[:, 0] * n_vertices + ends[:, 1])
-    back = np.sort(ends[:, 1] * n_vertices + ends[:, 0])
-    return bool(len(faces)) and np.array_equal(forth, back) and not (forth[1:] == forth[:-1]).any()
+    # A matrix of edges, counted: scipy sorts by counting, in a fifth of the time that sorting names takes.
+    forth = (faces.ravel().astype(np.int32), faces[:, [1, 2, 0]].ravel().astype(np.int32))
+    count = coo_array((np.ones(faces.size, dtype=np.int32), forth), shape=(n_vertices, n_vertices)).tocsc()
+    back = count.tocsr()
+    return bool(
+        len(faces)
+        and (count.data == 1).all()
+        and np.array_equal(count.indptr, back.indptr)
+        and np.array_equal(count.indices, back.indices)
+    )
 
 
 def _is_needed(corners: Float[np.ndarray, "n 3"], scene: RayScene, tables: Sequence[SilhouetteTable]) -> bool:
