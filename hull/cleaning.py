@@ -29,9 +29,9 @@ def keep_what_matters(
     """Which vertices (V,) stay, faces that count those only, and one sentence for each kind of thing that
     was left out."""
     label = face_pieces(faces, len(vertices))
-    volumes = piece_volumes(vertices, faces, label)
-    if len(volumes) == 1:
+    if not label.any():
         return np.ones(len(vertices), dtype=bool), faces, ()
+    volumes = piece_volumes(vertices, faces, label)
     largest = int(np.argmax(volumes))
     keep = np.zeros(len(volumes), dtype=bool)
     keep[largest] = True
@@ -63,7 +63,9 @@ def face_pieces(faces: Int[np.ndarray, "f 3"], n_vertices: int) -> Int[np.ndarra
     graph = coo_array(
         (np.ones(len(ends), dtype=bool), (ends[:, 0], ends[:, 1])), shape=(n_vertices, n_vertices)
     )
-    _, of_vertex = connected_components(graph.tocsr(), directed=False)
+    n_pieces, of_vertex = connected_components(graph.tocsr(), directed=False)
+    if n_pieces == 1:
+        return np.zeros(len(faces), dtype=np.int64)
     return np.unique(of_vertex[faces[:, 0]], return_inverse=True)[1].ravel()
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from hull.culling import Culling
-from hull.surface import Crossings, exits
+from hull.surface import Crossings, by_table, exits
 from hull.tables import OUTSIDE, SilhouetteTable
 
 # In voxels: edges whose middle is deeper than the first are split; nothing is moved further than the second.
@@ -79,15 +79,11 @@ def _still_inside(
     The cameras that cut an edge's ends refuse almost all of its middle, so they are asked first.
     """
     for cut_by in (cut_by_1, cut_by_2):
-        order = np.argsort(cut_by[chosen], kind="stable")
-        chosen = chosen[order]
-        limits = np.searchsorted(cut_by[chosen], np.arange(len(tables) + 1))
-        kept = [chosen[: limits[0]]]
-        for table_idx, table in enumerate(tables):
-            asked = chosen[limits[table_idx] : limits[table_idx + 1]]
-            kept.append(asked[table.ask_points(places.take(asked, axis=1)) != OUTSIDE])
-        chosen = np.concatenate(kept)
-    chosen = np.sort(chosen)
+        still = np.ones(len(chosen), dtype=bool)
+        for table_idx, asked in by_table(cut_by.take(chosen), len(tables)):
+            answers = tables[table_idx].ask_points(places.take(chosen.take(asked), axis=1))
+            still[asked] = answers != OUTSIDE
+        chosen = chosen.take(np.flatnonzero(still))
     places = places.take(chosen, axis=1)
     blocks = None if culling is None else culling.blocks_of(places)
     inside = np.ones(len(chosen), dtype=bool)

@@ -7,7 +7,7 @@ surface four times as accurate as the grid, without distance transforms.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,14 +78,25 @@ def exits(
             asked = np.arange(origin.shape[1])
         else:
             asked = culling.may_refuse(table_idx, blocks)
-        refused = asked[table.ask_points(place.take(asked, axis=1)) == OUTSIDE]
+        answers = table.ask_points(place.take(asked, axis=1))
+        refused = asked.take(np.flatnonzero(answers == OUTSIDE))
         if not len(refused):
             continue
-        cut_by[refused] = table_idx
         start, way = origin.take(refused, axis=1), along.take(refused, axis=1)
-        exit_at[refused] = _way_out(table, table.projected(start), table.projected_way(way), exit_at[refused])
-        place[:, refused] = start + way * exit_at[refused]
+        share = _way_out(table, table.projected(start), table.projected_way(way), exit_at[refused])
+        cut_by[refused] = table_idx
+        exit_at[refused] = share
+        place[:, refused] = start + way * share
     return exit_at, cut_by
+
+
+def by_table(of_each: Int[np.ndarray, " n"], n_tables: int) -> Iterator[tuple[int, Int[np.ndarray, " m"]]]:
+    """Each table with the places (M,) in `of_each` (N,) that name it; -1 names none."""
+    order = np.argsort(of_each, kind="stable")
+    limits = np.searchsorted(of_each.take(order), np.arange(n_tables + 1))
+    for table_idx in range(n_tables):
+        if limits[table_idx] < limits[table_idx + 1]:
+            yield table_idx, order[limits[table_idx] : limits[table_idx + 1]]
 
 
 def _way_out(

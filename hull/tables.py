@@ -111,30 +111,42 @@ class SilhouetteTable:
         how far a cube reaches in the picture is the exact one for a projective map with a single division .
         """
         p = self.projection
-        u, v, depth = p[:, :3] @ centres + p[:, 3:]
-        reach_depth = half_m * np.abs(p[2, :3]).sum()
-        nearest = depth - reach_depth
-        in_front = nearest > 0.0
-        safe_depth = np.where(in_front, depth, 1.0)
+        u, v, depth = self.projected(centres)
+        reach_depth = half_m * float(np.abs(p[2, :3]).sum())
+        all_in_front = bool(len(depth)) and float(depth.min()) > reach_depth
+        in_front = depth > reach_depth
+        if not all_in_front:
+            safe_depth = np.where(in_front, depth, 2.0 * reach_depth + 1.0)
+        else:
+            safe_depth = depth
         u /= safe_depth
         v /= safe_depth
-        per_depth = half_m / np.where(in_front, nearest, 1.0)
+        per_depth = half_m / (safe_depth - reach_depth)
+        reach_u, reach_v = (
+            per_depth
+            * (
+                np.abs(row[0] - pixel * p[2, 0])
+                + np.abs(row[1] - pixel * p[2, 1])
+                + np.abs(row[2] - pixel * p[2, 2])
+            )
+            for pixel, row in ((u, p[0]), (v, p[1]))
+        )
         # The slack covers rounding: a corner that falls on a pixel's edge must be found on either side of it.
-        reach_u = per_depth * sum(np.abs(p[0, k] - u * p[2, k]) for k in range(3)) + 1e-6
-        reach_v = per_depth * sum(np.abs(p[1, k] - v * p[2, k]) for k in range(3)) + 1e-6
-        column_0, column_1 = self._clipped(u - reach_u, 0), self._clipped(u + reach_u, 0)
-        row_0, row_1 = self._clipped(v - reach_v, 1), self._clipped(v + reach_v, 1)
+        reach_u += 1e-6
+        reach_v += 1e-6
+        left, right, top, bottom = u - reach_u, u + reach_u, v - reach_v, v + reach_v
 
-        answers = self._answers_in(column_0, column_1, row_0, row_1)
-        within = (column_0 >= self.lowest[0]) & (column_1 <= self.highest[0])
-        within &= (row_0 >= self.lowest[1]) & (row_1 <= self.highest[1])
-        if not within.all():
+        answers = self._answers_in(left, right, top, bottom)
+        (x_0, y_0), (x_1, y_1) = self.lowest, (self.highest[0] + 1, self.highest[1] + 1)
+        if not (
+            len(u) and left.min() >= x_0 and right.max() < x_1 and top.min() >= y_0 and bottom.max() < y_1
+        ):
+            within = (left >= x_0) & (right < x_1) & (top >= y_0) & (bottom < y_1)
             answers[~within] |= NO_EVIDENCE
-            beyond = (column_1 < self.lowest[0]) | (column_0 > self.highest[0])
-            beyond |= (row_1 < self.lowest[1]) | (row_0 > self.highest[1])
-            answers[beyond] = NO_EVIDENCE
-        if not in_front.all():
-            answers[~in_front] = np.where(depth[~in_front] + reach_depth <= 0.0, NO_EVIDENCE, UNDECIDED)
+            answers[(right < x_0) | (left >= x_1) | (bottom < y_0) | (top >= y_1)] = NO_EVIDENCE
+        if not all_in_front:
+            behind = np.flatnonzero(~in_front)
+            answers[behind] = np.where(depth[behind] + reach_depth <= 0.0, NO_EVIDENCE, UNDECIDED)
         return answers
 
     def _pixels(
@@ -183,39 +195,54 @@ class SilhouetteTable:
         lower = ((bits >> 2) & 1) * (1.0 - fx) + ((bits >> 3) & 1) * fx
         return answers, outline, upper * (1.0 - fy) + lower * fy
 
-    def _clipped(self, pixel: Float[np.ndarray, " n"], axis: int) -> np.ndarray:
-        # Far-off pixels are all the same to us; clipping keeps them inside the integers' range.
-        return np.floor(np.minimum(np.maximum(pixel, -4.0), self.highest[axis] + 4.0)).astype(np.int64)
-
     def _answers_in(
-        self, column_0: np.ndarray, column_1: np.ndarray, row_0: np.ndarray, row_1: np.ndarray
+        self,
+        left: Float[np.ndarray, " n"],
+        right: Float[np.ndarray, " n"],
+        top: Float[np.ndarray, " n"],
+        bottom: Float[np.ndarray, " n"],
     ) -> UInt8[np.ndarray, " n"]:
-        """The OR of all blocks that rectangles of codes touch, as four overlapping squares of one level."""
+        """The OR of all blocks that rectangles (pixels) touch, as four overlapping squares of one level."""
         levels, height, width = self.squares.shape
-        left, right = (column_0 - self.origin[0]) >> 2, (column_1 - self.origin[0]) >> 2
-        top, bottom = (row_0 - self.origin[1]) >> 2, (row_1 - self.origin[1]) >> 2
-        # np.clip costs more than the comparisons for the few cells that there often are.
-        x_0, x_1 = (np.minimum(np.maximum(side, 0), width - 1) for side in (left, right))
-        y_0, y_1 = (np.minimum(np.maximum(side, 0), height - 1) for side in (top, bottom))
-        side = np.maximum(x_1 - x_0, y_1 - y_0) + 1
+        # Blocks are counted from 1 here, so that 0 and one past the last stand for all that is not stored.
+        first_x, last_x = (self._block(pixel, 0, width) for pixel in (left, right))
+        first_y, last_y = (self._block(pixel, 1, height) for pixel in (top, bottom))
+        background = (last_x < 1) | (first_x > width) | (last_y < 1) | (first_y > height)
+        x_0, y_0 = np.maximum(first_x, 1) - 1, np.maximum(first_y, 1) - 1
+        x_1, y_1 = np.minimum(last_x, width) - 1, np.minimum(last_y, height) - 1
+        side = np.maximum(np.maximum(x_1 - x_0, y_1 - y_0), 0) + 1
+        largest = int(side.max(initial=1))
         level = _LEVEL_OF_SIDE.take(np.minimum(side, len(_LEVEL_OF_SIDE) - 1))
-        too_large = level >= levels
-        level = np.minimum(level, levels - 1)
+        too_large = level >= levels if largest > 1 << levels else None
+        if too_large is not None:
+            level = np.minimum(level, levels - 1)
         reach = (1 << level) - 1
         # A square wider than the rectangle starts further left or up: it then covers more, which is still
         # safe.
+        x_0, y_0 = np.minimum(x_0, width - 1), np.minimum(y_0, height - 1)
         x_1 = np.maximum(x_1 - reach, 0)
         y_1 = np.maximum(y_1 - reach, 0)
-        flat = self.squares.ravel()
-        upper = (level * height + y_0) * width
-        lower = (level * height + y_1) * width
-        answers = (
-            flat.take(upper + x_0) | flat.take(upper + x_1) | flat.take(lower + x_0) | flat.take(lower + x_1)
-        )
-        answers[too_large] = UNDECIDED
+        flat = self.squares.reshape(-1)
+        level *= height
+        upper = (level + y_0) * width
+        lower = (level + y_1) * width
+        answers = flat.take(upper + x_0)
+        answers |= flat.take(upper + x_1)
+        answers |= flat.take(lower + x_0)
+        answers |= flat.take(lower + x_1)
+        if too_large is not None:
+            answers[too_large] = UNDECIDED
         # All that is not stored is background (or beyond the picture, which the caller adds).
-        answers[(right < 0) | (left >= width) | (bottom < 0) | (top >= height)] = OUTSIDE
+        answers[background] = OUTSIDE
         return answers
+
+    def _block(self, pixel: Float[np.ndarray, " n"], axis: int, n_blocks: int) -> Int[np.ndarray, " n"]:
+        """The block a pixel lies in, counted from 1; 0 and n_blocks + 1 beyond the stored ones."""
+        place = pixel * (1.0 / BLOCK_PX)
+        place += 1.0 - self.origin[axis] / BLOCK_PX
+        np.maximum(place, 0.0, out=place)
+        np.minimum(place, n_blocks + 1.0, out=place)
+        return place.astype(np.intp)
 
 
 def _divided(
@@ -297,17 +324,16 @@ def _surroundings(image: UInt8[np.ndarray, "h w"]) -> tuple[UInt8[np.ndarray, "h
 
 def _codes(pixels: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h-1 w-1"]:
     """(h w) pixels -> (h-1 w-1) codes of their 2 x 2 neighbourhoods."""
-    bits = (pixels > UNKNOWN).view(np.uint8)
+    person = (pixels > UNKNOWN).view(np.uint8)
+    # Sums, because numpy adds bytes many at a time and shifts them one by one.
+    rows = person[:, 1:] + person[:, 1:]
+    rows += person[:, :-1]
+    codes = rows[1:] + rows[1:]
+    codes += codes
+    codes += rows[:-1]
     unknown = pixels == UNKNOWN
     if unknown.any():
-        bits |= unknown.view(np.uint8) << 4
-    # The unknown bit must not wander when the person bits are shifted, so it is OR-ed in separately below.
-    person = bits & 1
-    codes = person[:-1, :-1] | (person[:-1, 1:] << 1)
-    codes |= person[1:, :-1] << 2
-    codes |= person[1:, 1:] << 3
-    if unknown.any():
-        flags = bits & _UNKNOWN_BIT
+        flags = unknown.view(np.uint8) * np.uint8(_UNKNOWN_BIT)
         codes |= flags[:-1, :-1] | flags[:-1, 1:] | flags[1:, :-1] | flags[1:, 1:]
     return codes
 
