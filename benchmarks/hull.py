@@ -44,17 +44,18 @@ FIGURE = (
 )
 
 
-def figure() -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of the capsules (they overlap; rays do not mind)."""
+def figure(n_around: int = 64) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of the capsules (they overlap; rays do not mind), `n_around` corners around."""
     vertices, faces, n = [], [], 0
-    polar, around = np.meshgrid(np.linspace(0, np.pi, 33), np.linspace(0, 2 * np.pi, 65))
+    m = n_around // 2 + 1
+    polar, around = np.meshgrid(np.linspace(0, np.pi, m), np.linspace(0, 2 * np.pi, n_around + 1))
     ball = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], axis=-1)
-    i, j = np.meshgrid(np.arange(64), np.arange(32), indexing="ij")
+    i, j = np.meshgrid(np.arange(n_around), np.arange(m - 1), indexing="ij")
     quad = [
-        (i * 33 + j).ravel(),
-        (i * 33 + j + 1).ravel(),
-        ((i + 1) * 33 + j).ravel(),
-        ((i + 1) * 33 + j + 1).ravel(),
+        (i * m + j).ravel(),
+        (i * m + j + 1).ravel(),
+        ((i + 1) * m + j).ravel(),
+        ((i + 1) * m + j + 1).ravel(),
     ]
     triangles = np.concatenate(
         [np.stack([quad[0], quad[1], quad[2]], 1), np.stack([quad[1], quad[3], quad[2]], 1)]

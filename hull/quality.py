@@ -18,7 +18,7 @@ from hull.errors import HullError
 from hull.marching import binary_surface
 from hull.rays import RayScene
 from hull.surface import cross_exactly
-from hull.tables import UNKNOWN, prepare_tables
+from hull.tables import BORDER_PX, UNKNOWN, prepare_tables
 from hull.visual_hull import Hull, grid_over
 from hull.witnesses import witness_rule
 
@@ -63,6 +63,64 @@ def silhouette_agreement(
         if union:
             scores[camera_idx] = int((covered & person & known).sum()) / union
     return scores
+
+
+def contour_distance(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Integer[np.ndarray, "f 3"],
+    rig: Iterable[Camera],
+    images: Sequence[np.ndarray | None],
+) -> Float[np.ndarray, " c"]:
+    """How far, per camera, the mesh's outline and the silhouette's are apart, in pixels; NaN: no evidence.
+
+    The mean distance from one to the nearest point of the other, averaged over both directions; outlines run
+    between a covered pixel's centre and one that is not. Places at unknown pixels or in the picture's border
+    count nowhere. The picture's diagonal where one of the two is missing altogether.
+    """
+    cameras = tuple(rig)
+    if len(cameras) != len(images):
+        raise HullError(
+            f"{len(cameras)} cameras but {len(images)} silhouettes; give one (or None) per camera, in order"
+        )
+    scene = RayScene(vertices, faces)
+    distances = np.full(len(cameras), np.nan)
+    for camera_idx, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+        if image is None:
+            continue
+        _check_size(camera, image)
+        known = image != UNKNOWN
+        known[:BORDER_PX] = known[-BORDER_PX:] = False
+        known[:, :BORDER_PX] = known[:, -BORDER_PX:] = False
+        distances[camera_idx] = mask_distance(scene.mask(camera), image > UNKNOWN, known)
+    return distances
+
+
+def mask_distance(
+    one: Bool[np.ndarray, "h w"], other: Bool[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
+) -> float:
+    """Mean distance, px, between the outlines of two masks, both ways, where `known`; NaN without any.
+
+    An outline may end where knowledge does, so the edge of the unknown is as near as the other outline.
+    """
+    from scipy.spatial import cKDTree
+
+    outlines = [_outline(mask, known) for mask in (one, other)]
+    if not len(outlines[0]) and not len(outlines[1]):
+        return float("nan")
+    if not len(outlines[0]) or not len(outlines[1]):
+        return float(np.hypot(*one.shape))
+    edge = _outline(known, np.ones_like(known))
+    trees = [cKDTree(np.concatenate([outline, edge])) for outline in outlines]
+    ways = [tree.query(outline)[0].mean() for tree, outline in zip(trees[::-1], outlines, strict=True)]
+    return float(np.mean(ways))
+
+
+def _outline(mask: Bool[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "n 2"]:
+    """(row, column) of the points half way between neighbouring known pixels of which one is in the mask."""
+    across = (mask[:, 1:] != mask[:, :-1]) & known[:, 1:] & known[:, :-1]
+    along = (mask[1:] != mask[:-1]) & known[1:] & known[:-1]
+    half_right, half_down = np.array([0.0, 0.5]), np.array([0.5, 0.0])
+    return np.concatenate([np.argwhere(across) + half_right, np.argwhere(along) + half_down])
 
 
 @dataclass(frozen=True)
