@@ -70,7 +70,8 @@ class MissedLines:
     refused : (M,) two or more cameras refuse wherever enough could see.
     unseen : (M,) there is a place that nobody refuses and too few cameras see.
     elsewhere : (M,) there is a place outside the carved box that nobody refuses and enough cameras see.
-    left : (M,) there is such a place inside the box: thinner than the grid, or a piece that was left out.
+    left : (M,) too few cameras refuse a place inside the box to cut it: it is thinner than the grid, or in a
+        piece that was left out.
     place : (M 3) a place on the line that the fewest refuse, world metres.
     """
 
@@ -114,19 +115,26 @@ def ways_through(table: SilhouetteTable, blocks: Int[np.ndarray, " n"]) -> Float
 
 
 def missed_lines(
-    tables: Sequence[SilhouetteTable], rule: WitnessRule, bounds: Bounds, scene: RayScene | None
+    tables: Sequence[SilhouetteTable],
+    rule: WitnessRule,
+    bounds: Bounds,
+    scene: RayScene | None,
+    votes: int = 1,
 ) -> tuple[Int[np.ndarray, " c"], MissedLines]:
-    """(C,) how many lines each table has, and those that miss the surface. `scene` None: nothing is left."""
+    """(C,) how many lines each table has, and those that miss the surface. `scene` None: nothing is left.
+
+    `votes` : so many cameras had to refuse a place to cut it; one fewer contradicts nobody.
+    """
     lines = lines_of_sight(tables)
     n_lines = np.bincount(lines.table, minlength=len(tables))
     missed = np.arange(len(lines.table))
     if scene is not None:
         missed = np.flatnonzero(~scene.meets(lines.origin, lines.way))
-    return n_lines, _examined(lines.chosen(missed), tables, rule, bounds)
+    return n_lines, _examined(lines.chosen(missed), tables, rule, bounds, votes)
 
 
 def _examined(
-    lines: Lines, tables: Sequence[SilhouetteTable], rule: WitnessRule, bounds: Bounds
+    lines: Lines, tables: Sequence[SilhouetteTable], rule: WitnessRule, bounds: Bounds, votes: int
 ) -> MissedLines:
     n_missed = len(lines.table)
     lines = lines.chosen(_spread(np.arange(n_missed), _N_EXAMINED))
@@ -154,11 +162,11 @@ def _examined(
                 solid = _deep_outside(tables[number], points[:, mine])
                 deep[line[mine[solid]], number] = True
     elsewhere = np.zeros(n, dtype=bool)
-    open_ = np.flatnonzero((least > 0) & ~unseen)
+    open_ = np.flatnonzero((least >= votes) & ~unseen)
     if len(open_):
         elsewhere[open_], far = _explained_outside(lines.chosen(open_), tables, rule, bounds)
         place[open_[elsewhere[open_]]] = far[elsewhere[open_]]
-    told = (least > 0) & ~unseen & ~elsewhere
+    told = (least >= votes) & ~unseen & ~elsewhere
     suspect[~told], deep[~told] = 0.0, False
     return MissedLines(
         table=lines.table,
@@ -166,9 +174,9 @@ def _examined(
         suspect=suspect,
         deep=deep,
         refused=told & (least >= 2),
-        unseen=unseen & (least > 0),
+        unseen=unseen & (least >= votes),
         elsewhere=elsewhere,
-        left=least == 0,
+        left=least < votes,
         place=place,
     )
 

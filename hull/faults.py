@@ -115,11 +115,13 @@ def settle(
     images: Sequence[UInt8[np.ndarray, "_h _w"] | None],
     bounds: Bounds | None,
     carve_with: CarveWith,
+    votes: int = 1,
 ) -> Settled:
     """Carve, look for contradictions, carve again without the cameras at fault, until the rest agrees.
 
-    `carve_with` makes the surface of some tables and raises EmptyHullError where nothing is left. That is
-    raised where nothing is left whatever few cameras are left out.
+    `votes`: so many cameras must refuse a place to cut it. `carve_with` makes the surface of some tables and
+    raises EmptyHullError where nothing is left; that is raised where nothing is left whatever few cameras are
+    left out.
     """
     cameras = _Cameras(
         tuple(rig), list(images), {table.camera_idx: table for table in prepare_tables(rig, images)}
@@ -134,13 +136,13 @@ def settle(
         except EmptyHullError as empty:
             error = empty
         scene = None if carved is None else carved.scene
-        n_lines, missed = missed_lines(tables, rule, box, scene)
+        n_lines, missed = missed_lines(tables, rule, box, scene, votes)
         blamed = _blamed(tables, n_lines, missed)
         if not blamed and missed.scale * len(missed.table) > _MOSTLY_MISSED * n_lines.sum():
             # Faults that agree with each other may have put the box anywhere.
-            n_lines, missed = missed_lines(tables, rule, _around(tables), scene)
+            n_lines, missed = missed_lines(tables, rule, _around(tables), scene, votes)
             blamed = _blamed(tables, n_lines, missed)
-        if carved is not None:
+        if carved is not None and votes == 1:
             blamed += [k for k in false_holes(tables, box) if k not in blamed]
         room = cameras.room()
         again = [k for k in blamed if tables[k].camera_idx in cameras.faults]

@@ -30,6 +30,7 @@ def raise_ridges(
     tables: Sequence[SilhouetteTable],
     voxel_m: float,
     culling: Culling | None = None,
+    votes: int = 1,
 ) -> tuple[Crossings, Int[np.ndarray, "f2 3"]]:
     """Vertices (the given ones first) and faces with the deep edges split. `normals`: outward, unit."""
     vertices, cut_by = crossings.vertices, crossings.cut_by
@@ -43,9 +44,9 @@ def raise_ridges(
     middle = 0.5 * (columns.take(a, axis=1) + columns.take(b, axis=1))
     places = middle + _DEPTH_SPLIT * way
     deep = np.flatnonzero(length > 0.5)
-    deep = _still_inside(tables, places, deep, cut_by[a], cut_by[b], culling)
+    deep = _still_inside(tables, places, deep, cut_by[a], cut_by[b], culling, votes)
     middle, way = middle.take(deep, axis=1), _FARTHEST * way.take(deep, axis=1)
-    exit_at, new_cut_by = exits(tables, middle, way, culling)
+    exit_at, new_cut_by = exits(tables, middle, way, culling, votes)
     ends = new_cut_by >= 0
     deep = deep[ends]
     new = (middle + way * exit_at)[:, ends].T
@@ -73,12 +74,13 @@ def _still_inside(
     cut_by_1: Int[np.ndarray, " n"],
     cut_by_2: Int[np.ndarray, " n"],
     culling: Culling | None,
+    votes: int,
 ) -> Int[np.ndarray, " k"]:
-    """Which (K,) of the places (3 N) chosen (M,) no camera sees outside.
+    """Which (K,) of the places (3 N) chosen (M,) fewer than `votes` cameras see outside.
 
-    The cameras that cut an edge's ends refuse almost all of its middle, so they are asked first.
+    The cameras that cut an edge's ends refuse almost all of its middle, so one alone is asked first.
     """
-    for cut_by in (cut_by_1, cut_by_2):
+    for cut_by in (cut_by_1, cut_by_2) if votes == 1 else ():
         still = np.ones(len(chosen), dtype=bool)
         for table_idx, asked in by_table(cut_by.take(chosen), len(tables)):
             answers = tables[table_idx].ask_points(places.take(chosen.take(asked), axis=1))
@@ -86,15 +88,15 @@ def _still_inside(
         chosen = chosen.take(np.flatnonzero(still))
     places = places.take(chosen, axis=1)
     blocks = None if culling is None else culling.blocks_of(places)
-    inside = np.ones(len(chosen), dtype=bool)
+    votes_left = np.full(len(chosen), votes)
     for table_idx, table in enumerate(tables):
         if culling is None or blocks is None:
-            asked = np.flatnonzero(inside)
+            asked = np.flatnonzero(votes_left)
         else:
             asked = culling.may_refuse(table_idx, blocks)
-            asked = asked[inside[asked]]
-        inside[asked[table.ask_points(places.take(asked, axis=1)) == OUTSIDE]] = False
-    return chosen[inside]
+            asked = asked[votes_left[asked] > 0]
+        votes_left[asked[table.ask_points(places.take(asked, axis=1)) == OUTSIDE]] -= 1
+    return chosen[votes_left > 0]
 
 
 def split_faces(faces: Int[np.ndarray, "f 3"], middle: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "f2 3"]:
