@@ -17,7 +17,9 @@ from bodyhull import __version__
 from bodyhull.config import RunConfig
 from bodyhull.errors import UserError
 from bodyhull.folder import RunFolder, write_atomically
-from capture.recording import Recording, open_recording
+from bodyhull.look_ahead import silhouettes_ahead
+from capture.recording import Recording, Silhouettes, open_recording
+from hull.bounds import Bounds
 from hull.errors import HullError
 from hull.faults import CameraFault
 from hull.hull_file import facts_file, load_hull, save_hull
@@ -161,9 +163,12 @@ def carve_stage(config: RunConfig) -> Recording:
     frames = dict(known)
     started = time.perf_counter()
     todo = [k for k in recording.frame_ids if not _carved(folder, k, known)]
-    for frame_id in tqdm(todo, desc="carve", unit="frame", disable=not todo):
-        frames[f"{frame_id:06d}"] = carve_frame(recording, folder, frame_id, config.voxel_mm).as_dict()
-        folder.update_stage("hull", frames=frames)
+    near: Bounds | None = None
+    with silhouettes_ahead(recording.silhouettes, todo) as ahead:
+        for silhouettes in tqdm(ahead, total=len(todo), desc="carve", unit="frame", disable=not todo):
+            carved, near = carve_frame(recording, folder, silhouettes, config.voxel_mm, near)
+            frames[f"{carved.frame_id:06d}"] = carved.as_dict()
+            folder.update_stage("hull", frames=frames)
     if todo:
         folder.update_stage(
             "hull", seconds=round(time.perf_counter() - started, 2), carved=len(todo), frames=frames
@@ -202,19 +207,24 @@ def _carved(folder: RunFolder, frame_id: int, known: dict[str, Any]) -> bool:
     return True
 
 
-def carve_frame(recording: Recording, folder: RunFolder, frame_id: int, voxel_mm: float) -> CarvedFrame:
-    """Carve one frame and write its hull; a frame that cannot be carved comes back marked."""
-    silhouettes = recording.silhouettes(frame_id)
+def carve_frame(
+    recording: Recording, folder: RunFolder, silhouettes: Silhouettes, voxel_mm: float, near: Bounds | None
+) -> tuple[CarvedFrame, Bounds | None]:
+    """Carve one frame and write its hull; a frame that cannot be carved comes back marked.
+
+    `near`: the box around the hull of the frame before, and the second result is that of this one.
+    """
+    frame_id = silhouettes.frame_id
     for problem in silhouettes.problems:
         tqdm.write(f"warning: {problem}", file=sys.stderr)
     try:
-        hull = build_hull(recording.rig, silhouettes.images, voxel_m=voxel_mm / 1e3)
+        hull = build_hull(recording.rig, silhouettes.images, voxel_m=voxel_mm / 1e3, near=near)
     except HullError as error:
         message = f"frame {frame_id:06d}: {error}"
         tqdm.write(f"warning: {message}", file=sys.stderr)
         folder.hull(frame_id).unlink(missing_ok=True)
         facts_file(folder.hull(frame_id)).unlink(missing_ok=True)
-        return CarvedFrame(frame_id, "failed", (*silhouettes.problems, message))
+        return CarvedFrame(frame_id, "failed", (*silhouettes.problems, message)), None
     for fault in hull.faults:
         tqdm.write(f"warning: frame {frame_id:06d}: {fault.sentence()}", file=sys.stderr)
     agreement = silhouette_agreement(hull.vertices, hull.faces, recording.rig, silhouettes.images)
@@ -222,7 +232,7 @@ def carve_frame(recording: Recording, folder: RunFolder, frame_id: int, voxel_mm
     path.parent.mkdir(parents=True, exist_ok=True)
     save_hull(path, hull)
     problems = (*silhouettes.problems, *hull.problems)
-    return CarvedFrame(
+    carved = CarvedFrame(
         frame_id,
         "degraded" if silhouettes.problems or hull.faults else "ok",
         problems,
@@ -230,3 +240,4 @@ def carve_frame(recording: Recording, folder: RunFolder, frame_id: int, voxel_mm
         round(hull.volume_m3, 6),
         hull.faults,
     )
+    return carved, Bounds(hull.vertices.min(axis=0), hull.vertices.max(axis=0))

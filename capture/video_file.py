@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Lock
 
 import cv2
 import numpy as np
@@ -25,6 +26,7 @@ class VideoFile:
     def __init__(self, path: Path) -> None:
         """Look at the file's head. Raises RecordingError for a file that is no readable video."""
         self.path = path
+        self._lock = Lock()
         self._capture: cv2.VideoCapture | None = None
         self._next_idx = 0
         self._kept: OrderedDict[int, UInt8[np.ndarray, "h w 3"]] = OrderedDict()
@@ -37,7 +39,14 @@ class VideoFile:
             )
 
     def read(self, frame_idx: int) -> UInt8[np.ndarray, "h w 3"] | None:
-        """The frame as RGB (h w 3), as filmed; None where the video has ended or cannot be decoded."""
+        """The frame as RGB (h w 3), as filmed; None where the video has ended or cannot be decoded.
+
+        Threads may ask at once (silhouettes are read ahead while pictures are looked up): one waits.
+        """
+        with self._lock:
+            return self._read(frame_idx)
+
+    def _read(self, frame_idx: int) -> UInt8[np.ndarray, "h w 3"] | None:
         if frame_idx in self._kept:
             return self._kept[frame_idx]
         if self._capture is None or frame_idx < self._next_idx:
@@ -76,4 +85,7 @@ class VideoFile:
 
     def __getstate__(self) -> dict[str, object]:
         # A decoder cannot travel to another process; it is opened again there.
-        return {**self.__dict__, "_capture": None, "_next_idx": 0, "_kept": OrderedDict()}
+        return {**self.__dict__, "_capture": None, "_next_idx": 0, "_kept": OrderedDict(), "_lock": None}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        self.__dict__.update(state, _lock=Lock())

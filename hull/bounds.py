@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.ndimage import find_objects, label
 
 from capture.camera import Camera
@@ -24,6 +24,8 @@ from hull.witnesses import witness_rule
 
 # The space searched, a cube as wide as twice the cameras' distance, has so many cells a side (6 cm at 4 m).
 _N_CELLS = 128
+# How far somebody gets between two frames, metres; more only costs the search of all space.
+_STEP_M = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,20 +58,54 @@ def find_bounds(rig: Iterable[Camera], images: Sequence[np.ndarray | None]) -> B
     return bounds_from_tables(prepare_tables(rig, images))
 
 
-def bounds_from_tables(tables: Sequence[SilhouetteTable]) -> Bounds:
-    """`find_bounds` for silhouettes that are prepared already."""
+def bounds_from_tables(tables: Sequence[SilhouetteTable], near: Bounds | None = None) -> Bounds:
+    """`find_bounds` for silhouettes that are prepared already.
+
+    `near`: where the person was a moment before. The same cells are asked, but only around there; the answer
+    counts if the piece found lies wholly inside what was searched and where the silhouettes' centroids meet,
+    and is then that piece of the whole search. Else all of space is searched.
+    """
     subject = meeting_point(tables)
     rule = witness_rule(tables, subject)
     # The person is nearer to the meeting point than the cameras are; a few cameras far off do not matter.
     reach = float(np.median([np.linalg.norm(table.centre - subject) for table in tables]))
     grid = Grid(subject - reach, 2 * reach / _N_CELLS, (_N_CELLS, _N_CELLS, _N_CELLS))
-    count = possible_witnesses(tables, rule, grid, votes=2 if len(tables) >= 4 else 1)
-    if not count.any():
+    votes = 2 if len(tables) >= 4 else 1
+    # With fewer votes what is given up early depends on all the cells that are asked.
+    if near is not None and votes > 1:
+        low = np.maximum(np.floor((near.low - _STEP_M - grid.low) / grid.voxel_m).astype(int), 0)
+        high = np.minimum(np.ceil((near.high + _STEP_M - grid.low) / grid.voxel_m).astype(int), _N_CELLS)
+        if (high > low + 2).all():
+            found = _largest_piece(possible_witnesses(tables, rule, grid, votes, (low, high)))
+            if found is not None and (found[0] > low).all() and (found[1] < high).all():
+                box = _around(grid, *found)
+                if (box.low < subject).all() and (subject < box.high).all():
+                    return box
+    found = _largest_piece(possible_witnesses(tables, rule, grid, votes))
+    if found is None:
         raise HullError(why_empty(tables, rule, subject - reach, subject + reach))
-    piece, _ = label(count > 0, structure=np.ones((3, 3, 3), dtype=bool))
-    vouched = np.bincount(piece.ravel(), count.ravel())
+    return _around(grid, *found)
+
+
+def _largest_piece(
+    count: Int[np.ndarray, "x y z"],
+) -> tuple[Int[np.ndarray, " 3"], Int[np.ndarray, " 3"]] | None:
+    """First cell and one past the last of the connected piece that the most cameras vouch for, if there is
+    any."""
+    filled = count > 0
+    spans = [np.flatnonzero(filled.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
+    if not len(spans[0]):
+        return None
+    low = np.array([span[0] for span in spans])
+    within = tuple(slice(span[0], span[-1] + 1) for span in spans)
+    piece, _ = label(filled[within], structure=np.ones((3, 3, 3), dtype=bool))
+    vouched = np.bincount(piece.ravel(), count[within].ravel())
     person = find_objects(piece)[int(np.argmax(vouched[1:]))]
     first, end = np.array([[s.start, s.stop] for s in person]).T
+    return low + first, low + end
+
+
+def _around(grid: Grid, first: Int[np.ndarray, " 3"], end: Int[np.ndarray, " 3"]) -> Bounds:
     # Whole cells were asked, so the box lies around the hull at any resolution and needs no padding beyond
     # one cell.
     return Bounds(grid.low + (first - 1) * grid.voxel_m, grid.low + (end + 1) * grid.voxel_m)

@@ -138,12 +138,17 @@ def carve(tables: Sequence[SilhouetteTable], rule: WitnessRule, grid: Grid, vote
 
 
 def possible_witnesses(
-    tables: Sequence[SilhouetteTable], rule: WitnessRule, grid: Grid, votes: int
+    tables: Sequence[SilhouetteTable],
+    rule: WitnessRule,
+    grid: Grid,
+    votes: int,
+    within: tuple[Int[np.ndarray, " 3"], Int[np.ndarray, " 3"]] | None = None,
 ) -> Int[np.ndarray, "x y z"]:
     """How many cameras may see each cell of the grid inside; 0 where it surely holds nothing of the hull.
 
     Conservative: cells are asked whole, down to the grid's own, and those that stay in question count. So
-    everything that `carve` could find at any resolution lies in a cell that is not 0.
+    everything that `carve` could find at any resolution lies in a cell that is not 0. `within`: first cell
+    and one past the last of the part to be looked at; the rest stays 0.
     """
     # From so few cells a side on, some can be decided: larger ones fill whole pictures.
     coarsest = max(int(np.log2(min(grid.shape))) - _FIRST_HALVINGS, 0)
@@ -153,9 +158,13 @@ def possible_witnesses(
     order = list(range(len(tables)))
     for level in range(coarsest, -1, -1):
         side = 1 << level
-        everywhere = np.ones(cells.shape[1], dtype=bool)
+        alive = np.ones(cells.shape[1], dtype=bool)
+        if within is not None:
+            low, high = within
+            alive &= ((cells + 1) * side > low[:, None]).all(axis=0)
+            alive &= (cells * side < high[:, None]).all(axis=0)
         centres = grid.centres(cells, side)
-        front = _ask(tables, rule, front, cells, everywhere, centres, 0.5 * side * grid.voxel_m, votes, order)
+        front = _ask(tables, rule, front, cells, alive, centres, 0.5 * side * grid.voxel_m, votes, order)
         final = np.full(front.cells.shape[1], level == 0) | ~front.unasked.any(axis=0)
         count = np.bitwise_count(front.hopeful(rule)).sum(axis=0, dtype=np.int32)[final]
         i, j, k = front.cells[:, final]

@@ -116,18 +116,19 @@ def settle(
     bounds: Bounds | None,
     carve_with: CarveWith,
     votes: int = 1,
+    near: Bounds | None = None,
 ) -> Settled:
     """Carve, look for contradictions, carve again without the cameras at fault, until the rest agrees.
 
     `votes`: so many cameras must refuse a place to cut it. `carve_with` makes the surface of some tables and
     raises EmptyHullError where nothing is left; that is raised where nothing is left whatever few cameras are
-    left out.
+    left out. `near`: as for `bounds_from_tables`.
     """
     cameras = _Cameras(
         tuple(rig), list(images), {table.camera_idx: table for table in prepare_tables(rig, images)}
     )
     for _ in range(_MOST_ROUNDS):
-        box = bounds if bounds is not None else _bounds_without_blank(cameras)
+        box = bounds if bounds is not None else _bounds_without_blank(cameras, near)
         tables = cameras.present()
         rule = witness_rule(tables, box.centre)
         carved, error = None, None
@@ -176,17 +177,17 @@ def _around(tables: Sequence[SilhouetteTable]) -> Bounds:
     return Bounds(middle - _PERSON_M, middle + _PERSON_M)
 
 
-def _bounds_without_blank(cameras: _Cameras) -> Bounds:
+def _bounds_without_blank(cameras: _Cameras, near: Bounds | None) -> Bounds:
     """The box; where there is none, cameras that show nobody are left out first, as far as that may be."""
     try:
-        return bounds_from_tables(cameras.present())
+        return bounds_from_tables(cameras.present(), near)
     except HullError:
         blank = [t.camera_idx for t in cameras.present() if _is_blank(t)]
         if not blank or len(blank) > cameras.room():
             raise
         cameras.out.update(blank)
         cameras.unjudged.update(blank)
-        return bounds_from_tables(cameras.present())
+        return bounds_from_tables(cameras.present(), near)
 
 
 def _is_blank(table: SilhouetteTable) -> bool:

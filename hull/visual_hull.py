@@ -112,6 +112,7 @@ def build_hull(
     voxel_m: float = 0.008,
     bounds: Bounds | None = None,
     options: HullOptions = HullOptions(),
+    near: Bounds | None = None,
 ) -> Hull:
     """The visual hull of one frame.
 
@@ -120,6 +121,7 @@ def build_hull(
     voxel_m : grid pitch. The surface is about four times as accurate; thinner parts than this may be lost.
     bounds : where to look; found from the silhouettes if None.
     options : everything else that is a choice.
+    near : the box around the person a moment before: looked there first, which is quicker and finds the same.
 
     Raises HullError: fewer than two silhouettes, a silhouette of another size than its camera's, or an empty
     hull, naming the cameras at fault.
@@ -137,11 +139,11 @@ def build_hull(
 
     faults: tuple[CameraFault, ...] = ()
     if options.find_faults:
-        settled = settle(cameras, images, bounds, carve_with, options.votes)
+        settled = settle(cameras, images, bounds, carve_with, options.votes, near)
         carved, faults = settled.carved, settled.faults
     else:
         tables = prepare_tables(cameras, images)
-        box = bounds if bounds is not None else bounds_from_tables(tables)
+        box = bounds if bounds is not None else bounds_from_tables(tables, near)
         carved = carve_with(tables, witness_rule(tables, box.centre), box)
     normals = vertex_normals(carved.vertices, carved.faces)
     return Hull(
