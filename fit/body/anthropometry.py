@@ -38,6 +38,11 @@ HEAD_HEIGHT_FROM_PARTS = 0.912  # chin to crown, from (tragion to crown) + (chin
 UPPER_ARM_FROM_ACROMION_RADIALE = 0.838  # joint centre to joint centre
 FOREARM_FROM_RADIALE_STYLION = 0.975
 CHEST_WITH_ARMS_RAISED = 1.12  # the latissimus spreads when the arms are held out
+ACROMION_BELOW_CHIN_M, CERVICALE_BELOW_CHIN_M = 0.048, -0.006
+"""At least so much of the neck is free: a stooped person's chin lies lower, but ours hold the head up."""
+NECK_ROOM_BLEND_M = 0.012
+MOST_BUST = 2.6
+"""Beyond it the template has too few vertices on the breast for a smooth one."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +89,9 @@ class Measurements:
     bust: float
     fullness: float = 0.0
     """Log of how much fuller the sections between the measured girths are than usual."""
+    waist_squareness: float = 0.0
+    """Log of how much the exponents of the trunk's sections exceed the usual: 2 is an ellipse, more a box."""
+    hip_squareness: float = 0.0
 
     @property
     def weight(self) -> float:
@@ -92,6 +100,8 @@ class Measurements:
 
 
 TRUNK_SECTIONS = ("chest", "waist", "hip")
+SQUARED_SECTIONS = ("waist", "hip")
+"""The chest is not among them: its outline is that of shoulder blades, breast and armpits."""
 GIRTHS = ("neck", "chest", "waist", "hip", "thigh", "knee", "calf", "ankle", "biceps", "forearm", "wrist")
 
 
@@ -198,6 +208,8 @@ def measure(
     muscle_score = 12.0 * (arm_over_belly - 0.5 * residual["waistcircumference"]) + 0.6 * definition_score
     breast = max(0.0, 1.0 - sex) * np.exp(0.35 * bust_score + 0.9 * fat)
     chest_of_men = 0.06 * float(np.clip(sex, 0, 1)) * np.exp(3 * fat)  # only fat builds one
+    head_height = (value["tragiontopofhead"] + value["mentonsellionlength"]) * HEAD_HEIGHT_FROM_PARTS
+    chin = value["stature"] - head_height
     return Measurements(
         sex=float(sex),
         stature=value["stature"],
@@ -213,7 +225,7 @@ def measure(
         biceps=value["bicepscircumferenceflexed"] * RESTING_FROM_FLEXED_BICEPS,
         forearm=value["forearmcircumferenceflexed"] * RESTING_FROM_FLEXED_FOREARM,
         wrist=value["wristcircumference"],
-        head_height=(value["tragiontopofhead"] + value["mentonsellionlength"]) * HEAD_HEIGHT_FROM_PARTS,
+        head_height=head_height,
         head_length=value["headlength"],
         head_breadth=value["headbreadth"],
         biacromial=value["biacromialbreadth"],
@@ -226,8 +238,8 @@ def measure(
         knee_height=value["kneeheightmidpatella"],
         crotch_height=value["crotchheight"],
         navel_height=value["waistheightomphalion"],
-        acromion_height=value["acromialheight"],
-        cervicale_height=value["cervicaleheight"],
+        acromion_height=_at_most(value["acromialheight"], chin - ACROMION_BELOW_CHIN_M, NECK_ROOM_BLEND_M),
+        cervicale_height=_at_most(value["cervicaleheight"], chin - CERVICALE_BELOW_CHIN_M, NECK_ROOM_BLEND_M),
         fat=fat,
         chest_breadth=value["chestbreadth"] * CHEST_WITH_ARMS_RAISED,
         chest_depth=value["chestdepth"],
@@ -236,8 +248,14 @@ def measure(
         hip_breadth=value["hipbreadth"],
         hip_depth=value["buttockdepth"],
         muscle=float(np.exp(0.35 * np.clip(muscle_score, -2.5, 2.5) + 0.35 * (sex - 0.5))),
-        bust=float(breast + chest_of_men),
+        bust=_at_most(float(breast + chest_of_men), MOST_BUST, MOST_BUST / 5),
     )
+
+
+def _at_most(value: float, most: float, blend: float) -> float:
+    """The smaller of the two, without a corner where they are within `blend` of each other."""
+    near = max(blend - abs(value - most), 0.0) / blend
+    return min(value, most) - 0.25 * near * near * blend
 
 
 @cache

@@ -1,9 +1,10 @@
 """What to model so that a tape reads what was asked: a fixed point per person.
 
 Smooth unions and muscles add to every section by an amount that depends on the whole person. So the body is
-modelled, measured with rays (`implicit_tape`) and modelled again with every girth, every depth of the trunk
-and the fullness between the girths moved by what was missed. Two rounds after a start from the average of the
-sex leave a few tenths of a per cent.
+modelled, measured with rays (`implicit_tape`) and modelled again with every girth, every depth and squareness
+of the trunk and the fullness between the girths moved by what was missed. Two rounds after a start from the
+average of the sex leave a few tenths of a per cent, as long as no knob comes to the end of its range; where
+one does, girths and volume are kept and the trunk's breadths and depths give way.
 """
 
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float
 
-from .anthropometry import GIRTHS, TRUNK_SECTIONS, Measurements, survey_mean
+from .anthropometry import GIRTHS, SQUARED_SECTIONS, TRUNK_SECTIONS, Measurements, survey_mean
 from .density import volume_litres
 from .implicit import ImplicitBody
 from .implicit_tape import RayTape
@@ -21,13 +22,21 @@ from .implicit_tape import RayTape
 N_ROUNDS = 2
 N_ROUNDS_OF_THE_AVERAGE = 2
 PROBE = 0.02  # of the finite differences
-RIDGE = {"girth": 0.002, "depth": 0.04, "fullness": 0.01}
+RIDGE = {"girth": 0.001, "depth": 0.004, "squareness": 0.001, "fullness": 0.002}
 """How much less a knob is turned that the tape hardly feels, against its squared response (about 1)."""
-KNOBS_LIMIT = {"girth": 0.20, "depth": 0.12, "fullness": 0.14}
+WEIGHT = {"girth": 1.0, "depth": 0.1, "squareness": 0.1, "fullness": 1.0}
+"""Of what the tape misses, squared: breadths and depths give way where not all can be had."""
+N_KNOBS_HELD = 6  # times that knobs at their ends are set aside
+KNOBS_LIMIT = {"girth": 0.20, "depth": 0.16, "squareness": 0.35, "fullness": 0.17}
 """Either way: beyond it a body fits the tape and no longer looks like one."""
 
 Model = Callable[[Measurements], tuple[ImplicitBody, Float[np.ndarray, "24 3"]]]
-KNOBS = (*GIRTHS, *(f"{name} depth" for name in TRUNK_SECTIONS), "fullness")
+KNOBS = (
+    *GIRTHS,
+    *(f"{name} depth" for name in TRUNK_SECTIONS),
+    *(f"{name} squareness" for name in SQUARED_SECTIONS),
+    "fullness",
+)
 
 
 @dataclass(frozen=True)
@@ -42,6 +51,8 @@ class Knobs:
         changed = {name: asked[name] * np.exp(value[name]) for name in GIRTHS}
         for name in TRUNK_SECTIONS:
             changed[f"{name}_depth"] = asked[f"{name}_depth"] * np.exp(value[f"{name} depth"])
+        for name in SQUARED_SECTIONS:
+            changed[f"{name}_squareness"] = value[f"{name} squareness"]
         return replace(m, **{k: float(v) for k, v in changed.items()}, fullness=value["fullness"])
 
 
@@ -53,18 +64,39 @@ def missed(m: Measurements, tape: RayTape, body: ImplicitBody) -> Float[np.ndarr
         np.log(asked[f"{name}_depth"] / asked[f"{name}_breadth"]) - reading.depth[name]
         for name in TRUNK_SECTIONS
     ]
+    squareness = [
+        np.log(asked[name] / (asked[f"{name}_breadth"] + asked[f"{name}_depth"])) - reading.squareness[name]
+        for name in SQUARED_SECTIONS
+    ]
     litres = volume_litres(m.weight, m.stature, m.sex)
-    return np.array([*girths, *depths, np.log(litres / reading.litres)])
+    return np.array([*girths, *depths, *squareness, np.log(litres / reading.litres)])
 
 
 def _by_knob(value: dict[str, float]) -> Float[np.ndarray, "k"]:
-    kinds = ["girth"] * len(GIRTHS) + ["depth"] * len(TRUNK_SECTIONS) + ["fullness"]
-    return np.array([value[kind] for kind in kinds])
+    return np.array([value["girth" if knob in GIRTHS else knob.split()[-1]] for knob in KNOBS])
 
 
-def _turned(knobs: Float[np.ndarray, "k"], change: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
-    most = _by_knob(KNOBS_LIMIT)
-    return np.clip(knobs + change, -most, most)
+def _turned(
+    knobs: Float[np.ndarray, "k"], response: Float[np.ndarray, "k k"], wanted: Float[np.ndarray, "k"]
+) -> Float[np.ndarray, "k"]:
+    """The knobs, within their limits, whose change comes nearest to what is wanted.
+
+    Weighted and damped least squares. A knob that would leave its range stays at its end, and the others are
+    solved again without it: so they make up for it as far as they can.
+    """
+    most, pull, damping = _by_knob(KNOBS_LIMIT), _by_knob(WEIGHT), _by_knob(RIDGE)
+    turned, free = knobs.copy(), np.ones(len(KNOBS), dtype=bool)
+    for _ in range(N_KNOBS_HELD):
+        rest = wanted - response[:, ~free] @ (turned - knobs)[~free]
+        left = response[:, free].T * pull
+        normal = left @ response[:, free] + np.diag(damping[free])
+        turned[free] = knobs[free] + np.linalg.solve(normal, left @ rest)
+        outside = free & (np.abs(turned) > most)
+        turned = np.clip(turned, -most, most)
+        if not outside.any():
+            break
+        free &= ~outside
+    return turned
 
 
 @dataclass(frozen=True)
@@ -72,8 +104,8 @@ class Start:
     """Where the rounds begin, from people who were solved before."""
 
     knobs: Float[np.ndarray, "k"]
-    gain: Float[np.ndarray, "k k"]
-    """Inverse of the tape's response: times what was missed, the change of the knobs."""
+    response: Float[np.ndarray, "k k"]
+    """Of the tape (rows) to the knobs (columns), logs."""
     rays_m: Float[np.ndarray, "r"] | None
 
 
@@ -83,16 +115,13 @@ def solve(m: Measurements, model: Model, start: Start, n_rounds: int) -> Start:
     for _ in range(n_rounds):
         body, joints = model(Knobs(knobs).applied(m))
         tape = RayTape(m, joints, start.rays_m) if tape is None else tape
-        knobs = _turned(knobs, start.gain @ missed(m, tape, body))
+        knobs = _turned(knobs, start.response, missed(m, tape, body))
     assert tape is not None
-    return Start(knobs, start.gain, tape.length)
+    return Start(knobs, start.response, tape.length)
 
 
-def response_gain(m: Measurements, model: Model, knobs: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k k"]:
-    """Inverse of the tape's response to the knobs at this person, by finite differences.
-
-    Damped (ridge), so that a knob that the tape hardly feels is not thrown about.
-    """
+def response_of(m: Measurements, model: Model, knobs: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k k"]:
+    """The tape's response (rows) to the knobs (columns) at this person, by finite differences."""
     body, joints = model(Knobs(knobs).applied(m))
     tape = RayTape(m, joints)
     for _ in range(2):  # rays settle
@@ -101,8 +130,7 @@ def response_gain(m: Measurements, model: Model, knobs: Float[np.ndarray, "k"]) 
     for k in range(len(KNOBS)):
         there, _ = model(Knobs(knobs + PROBE * (np.arange(len(KNOBS)) == k)).applied(m))
         response[:, k] = (here - missed(m, tape, there)) / PROBE
-    normal = response.T @ response + np.diag(_by_knob(RIDGE))
-    return np.linalg.solve(normal, response.T)
+    return response
 
 
 def modelled_for(m: Measurements, model: Model) -> Measurements:
@@ -112,7 +140,7 @@ def modelled_for(m: Measurements, model: Model) -> Measurements:
     assert male.rays_m is not None
     start = Start(
         mix_arrays(female.knobs, male.knobs, m.sex),
-        mix_arrays(female.gain, male.gain, m.sex),
+        mix_arrays(female.response, male.response, m.sex),
         mix_arrays(female.rays_m, male.rays_m, m.sex),
     )
     return Knobs(solve(m, model, start, N_ROUNDS).knobs).applied(m)
@@ -128,6 +156,6 @@ def average_start(sex: float, model: Model) -> Start:
     """The survey's average person of this sex, solved from nothing."""
     average, start = survey_mean(sex), Start(np.zeros(len(KNOBS)), np.eye(len(KNOBS)), None)
     for _ in range(N_ROUNDS_OF_THE_AVERAGE):
-        gain = response_gain(average, model, start.knobs)
-        start = solve(average, model, replace(start, gain=gain), 2)
+        response = response_of(average, model, start.knobs)
+        start = solve(average, model, replace(start, response=response), 2)
     return start

@@ -44,6 +44,7 @@ class Reading:
 
     girth: dict[str, float]
     depth: dict[str, float]  # log of depth over breadth, by trunk section
+    squareness: dict[str, float]  # log of girth over breadth and depth together, by trunk section
     litres: float
 
 
@@ -178,7 +179,7 @@ class RayTape:
         mirrored = (flat @ (support * [[-1.0], [1.0]])).max(1)
         reach = np.where(is_half[:, None], np.maximum(reach, mirrored), reach)
         perimeter = reach.mean(1) * 2 * np.pi
-        girth, depth = {}, {}
+        girth, depth, squareness = {}, {}, {}
         for name in GIRTHS:
             values = perimeter[self.which[name]]
             best = values.argmin() if name in SLIMMEST else values.argmax()
@@ -187,8 +188,10 @@ class RayTape:
                 section = self.which[name][best]
                 quarter = N_DIRECTIONS // 4
                 breadth = 2 * reach[section, 0]
-                depth[name] = float(np.log((reach[section, quarter] + reach[section, 3 * quarter]) / breadth))
-        return Reading(girth, depth, self._litres(flat, is_half))
+                through = reach[section, quarter] + reach[section, 3 * quarter]
+                depth[name] = float(np.log(through / breadth))
+                squareness[name] = float(np.log(girth[name] / (breadth + through)))
+        return Reading(girth, depth, squareness, self._litres(flat, is_half))
 
     def _litres(self, flat: Float[np.ndarray, "s r 2"], is_half: np.ndarray) -> float:
         after = np.roll(flat, -1, 1)

@@ -13,9 +13,11 @@ from .trunk import bell, between_girths
 MIDLINE_GAP_M = 0.004  # left between the thighs
 ARM_GIRTHS = (("biceps", 0.5), ("biceps", 0.75), ("forearm", 1.25), ("wrist", 1.95))
 LEG_GIRTHS = (("hip", 0.0), ("thigh", 0.22), ("thigh", 0.45), ("knee", 1.0), ("calf", 1.33), ("ankle", 1.90))
-BETWEEN_LEG_GIRTHS = (0.58, 0.17)
-"""Where no girth holds the leg (0 hip, 1 knee) and how far that reaches: `Measurements.fullness` acts
-there.
+HIP_OF_LEG = (-0.10, 0.20)
+"""Where the leg's sections are part of the hip's, and how far that reaches."""
+BETWEEN_LEG_GIRTHS = ((0.66, 0.16), (1.60, 0.09))
+"""Where no girth holds the leg (0 hip, 1 knee, 2 ankle) and how far that reaches: `Measurements.fullness`
+acts there.
 """
 
 
@@ -42,7 +44,7 @@ def add_leg(body: ImplicitBody, b: Build) -> None:
     rows, along = [], []
     for station, lateral, medial, front, back in LEG:
         q = between_girths(station, LEG_GIRTHS, b.ratio_mid)
-        q *= np.exp(m.fullness * bell(station, *BETWEEN_LEG_GIRTHS))
+        q *= np.exp(m.fullness * sum(bell(station, *place) for place in BETWEEN_LEG_GIRTHS))
         at_knee = np.exp(-(((station - 1) / 0.35) ** 2))
         shift_x, shift_z = 0.004 * at_knee, 0.014 * at_knee
         out, inner, front, back = (q * radius for radius in (lateral, medial, front, back))
@@ -53,7 +55,8 @@ def add_leg(body: ImplicitBody, b: Build) -> None:
             limited = room - 0.006 * np.log1p(np.exp((room - inner) / 0.006))
             lost, inner = inner - limited, limited
             out, front, back = out + 0.15 * lost, front + 0.4 * lost, back + 0.4 * lost
-        rows.append((station, shift_x, shift_z, out, inner, front, back, 2.1, 2.1))
+        exponent = 2.1 * np.exp(m.hip_squareness * bell(station, *HIP_OF_LEG))
+        rows.append((station, shift_x, shift_z, out, inner, front, back, exponent, exponent))
         along.append(t)
     down = ankle - hip
     body.add(Loft(hip, down, (1, 0, 0), (0, 0, 1), rows, along, 0.045, (0.05, 0.02)))

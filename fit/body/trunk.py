@@ -16,7 +16,7 @@ PARTING_M = 0.0035  # half the gap between the thighs
 TORSO_GIRTHS = (("hip", 0.515), ("waist", 0.602), ("chest", 0.725), ("chest", 0.815), ("neck", 0.840))
 SECTION_LEVELS = {"chest": (0.735, 0.075), "waist": (0.600, 0.055), "hip": (0.510, 0.050)}
 """Where along the stature the depth of a section is measured, and how far (1 sigma) it is felt."""
-BETWEEN_GIRTHS = (0.666, 0.032)
+BETWEEN_GIRTHS = ((0.660, 0.024), (0.788, 0.022))
 """Where no girth holds the trunk, and how far that reaches: `Measurements.fullness` acts there."""
 
 
@@ -42,19 +42,21 @@ def between_girths(station: float, girths: tuple[tuple[str, float], ...], ratio:
 
 def add_torso(body: ImplicitBody, b: Build) -> None:
     m = b.m
+    square = {"waist": m.waist_squareness, "hip": m.hip_squareness}
     rows, along = [], []
     for fraction, width_m, width_f, front_m, front_f, back_m, back_f, n_front, n_back, powers in TORSO:
         q, (power_w, power_f, power_b) = between_girths(fraction, TORSO_GIRTHS, b.ratio), powers
         deeper = np.exp(
             0.5 * sum(bell(fraction, *level) * b.depth[name] for name, level in SECTION_LEVELS.items())
         )
-        fuller = np.exp(m.fullness * bell(fraction, *BETWEEN_GIRTHS))
+        fuller = np.exp(m.fullness * sum(bell(fraction, *place) for place in BETWEEN_GIRTHS))
+        squarer = np.exp(sum(bell(fraction, *SECTION_LEVELS[name]) * value for name, value in square.items()))
         width = mix((width_f, width_m), m.sex) * q**power_w / deeper * fuller
         front = mix((front_f, front_m), m.sex) * q**power_f * deeper * fuller
-        back = mix((back_f, back_m), m.sex) * q**power_b * deeper * fuller
+        back = mix((back_f, back_m), m.sex) * q**power_b * deeper * fuller**0.6  # no hump
         if fraction > 0.75:  # the shoulder girdle follows the skeleton
             width *= b.ratio["biacromial"] ** 0.6
-        rows.append((fraction, 0, 0, width, width, front, back, n_front, n_back))
+        rows.append((fraction, 0, 0, width, width, front, back, n_front * squarer, n_back * squarer))
         along.append(b.y(fraction))
     body.add(Loft((0, 0, 0), (0, 1, 0), (1, 0, 0), (0, 0, 1), rows, along, 0.02, (0.012, 0.03)))
 
