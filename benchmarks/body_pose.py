@@ -5,8 +5,9 @@
     python -m benchmarks.body_pose --speed            # forward and Jacobian; theirs where it is installed
 
 Volume is counted of the whole body and of the segment around the joint alone (its part labels, closed by a
-fan over each open end), because the whole hides a pinch. Times are the least of the repetitions, both
-libraries in one process and in double precision.
+fan over each open end), because the whole hides a pinch. A second table tells the space that the body fills
+in deep bends: there belly and thigh overlap, which the signed volume of the first counts twice. Times are the
+least of the repetitions, both libraries in one process and in double precision.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fit.body import BodyModel, load_body
-from fit.body.sections import volume_m3
+from fit.body import BodyModel, load_body, shape_space
+from fit.body.segments import Segment
 from fit.body.skeleton import JOINT, N_JOINTS, axis_angle_to_matrix, blend_linearly, world_from_rest
 
 Turns = dict[str, tuple[float, float, float]]
@@ -65,6 +66,9 @@ BENDS: tuple[tuple[str, Turns, tuple[str, ...]], ...] = (
 )  # fmt: skip
 
 
+DEEP_BENDS = ("hip flexed 110", "knee 140", "elbow 140", "spine flexed 60", "squat", "sit")
+
+
 def pose_of(turns: Turns) -> np.ndarray:
     """Rotation vectors (24 3), rad."""
     pose = np.zeros((N_JOINTS, 3))
@@ -85,56 +89,37 @@ def posed(model: BodyModel, template: np.ndarray, pose: np.ndarray) -> np.ndarra
     return blend_linearly(corrected, model.weights, bones)[0]
 
 
-def closed_part(model: BodyModel, parts: tuple[str, ...]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Faces of these parts, and every boundary loop's directed edges (n 2); all faces where none is named."""
-    if not parts:
-        return model.faces, []
-    inside = np.isin(model.parts, [JOINT[p] for p in parts])
-    faces = model.faces[inside[model.faces].all(1)]
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    known = {(int(a), int(b)) for a, b in edges}
-    rim = [(a, b) for a, b in known if (b, a) not in known]
-    loops = _loops(rim)
-    return faces, loops
+def segment_of(model: BodyModel, parts: tuple[str, ...]) -> Segment:
+    """The segment of these parts; the whole body where none is named."""
+    return Segment.of(model.faces, np.isin(model.parts, [JOINT[p] for p in parts]) | (not parts))
 
 
-def _loops(rim: list[tuple[int, int]]) -> list[np.ndarray]:
-    """Rim edges grouped by what they are connected to."""
-    root: dict[int, int] = {}
-
-    def find(a: int) -> int:
-        while root.setdefault(a, a) != a:
-            a = root[a]
-        return a
-
-    for a, b in rim:
-        root[find(a)] = find(b)
-    groups: dict[int, list[tuple[int, int]]] = {}
-    for a, b in rim:
-        groups.setdefault(find(a), []).append((a, b))
-    return [np.array(g) for g in groups.values()]
-
-
-def volume_of(vertices: np.ndarray, faces: np.ndarray, loops: list[np.ndarray]) -> float:
-    """Volume (m3) of faces closed by a fan over each loop."""
-    total = volume_m3(vertices, faces)
-    for loop in loops:
-        middle = vertices[loop[:, 0]].mean(0)
-        total += float(np.einsum("a,na->", middle, np.cross(vertices[loop[:, 1]], vertices[loop[:, 0]])) / 6)
-    return total
+def union_volume_m3(vertices: np.ndarray, faces: np.ndarray, step_m: float = 0.003) -> float:
+    """Volume of the space a closed mesh fills, overlaps once, by upright columns a step apart."""
+    corners = vertices[faces]
+    flat = corners[:, :, [2, 0]] / step_m + 0.137  # off the grid, or columns would hit vertices of the seam
+    low, high = np.ceil(flat.min(1)).astype(int), np.floor(flat.max(1)).astype(int)
+    n = np.maximum(high - low + 1, 0)
+    face = np.repeat(np.arange(len(faces)), n.prod(1))
+    k = np.arange(len(face)) - np.repeat(np.cumsum(n.prod(1)) - n.prod(1), n.prod(1))
+    column = low[face] + np.stack([k // n[face, 1], k % n[face, 1]], 1)
+    a, b, c = (flat[face, i] - column for i in range(3))
+    share = np.stack([p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] for p, q in ((b, c), (c, a), (a, b))], 1)
+    hit = (share > 0).all(1) | (share < 0).all(1)
+    face, column, share = face[hit], column[hit], share[hit]
+    area = share.sum(1)
+    height = (share * corners[face, :, 1]).sum(1) / area
+    order = np.lexsort((height, column[:, 1], column[:, 0]))
+    column, height = column[order], height[order]
+    inside = np.cumsum(-np.sign(area[order]))[:-1] > 0.5
+    same = (column[1:] == column[:-1]).all(1)
+    return float(np.diff(height)[same & inside].sum() * step_m**2)
 
 
 def weight_component(model: BodyModel) -> int:
-    """The shape component that changes volume most at a given stature: the one a person would call weight."""
-    change = []
-    for k in range(min(model.n_anthropometric, 10)):
-        betas = np.zeros(model.n_betas)
-        ratio = []
-        for betas[k] in (-2, 2):
-            v = model.shaped(betas)
-            ratio.append(volume_m3(v, model.faces) / np.ptp(v[:, 1]) ** 3)
-        change.append(abs(np.log(ratio[1] / ratio[0])))
-    return int(np.argmax(change))
+    """The shape component that a person would call weight."""
+    anthropometric = model.shape_directions[:, :, : model.n_anthropometric]
+    return shape_space.weight_component(model.template, anthropometric, model.faces)
 
 
 def kept_volume(model: BodyModel, betas: np.ndarray) -> list[tuple[str, float, float]]:
@@ -145,15 +130,23 @@ def kept_volume(model: BodyModel, betas: np.ndarray) -> list[tuple[str, float, f
         bent = posed(model, template, pose_of(turns))
         changes = []
         for chosen in ((), parts):
-            faces, loops = closed_part(model, chosen)
-            before, after = (volume_of(v, faces, loops) for v in (template, bent))
-            changes.append(100 * (after / before - 1))
+            segment = segment_of(model, chosen)
+            changes.append(100 * (segment.volume_m3(bent) / segment.volume_m3(template) - 1))
         rows.append((name, changes[0], changes[1]))
     return rows
 
 
+def filled_space(model: BodyModel, betas: np.ndarray) -> list[float]:
+    """Per deep bend: change of the space that the whole body fills, per cent."""
+    template = model.shaped(betas)
+    before = union_volume_m3(template, model.faces)
+    turns_of = {name: turns for name, turns, _ in BENDS}
+    bent = [posed(model, template, pose_of(turns_of[name])) for name in DEEP_BENDS]
+    return [100 * (union_volume_m3(v, model.faces) / before - 1) for v in bent]
+
+
 def print_volume_table() -> None:
-    columns = []
+    columns, filled = [], []
     for sex in ("neutral", "female", "male"):
         model = load_body(f"free:{sex}", show_progress=False)
         heavy = weight_component(model)
@@ -161,6 +154,7 @@ def print_volume_table() -> None:
             betas = np.zeros(model.n_betas)
             betas[heavy] = step
             columns.append((f"{sex} {step:+d}" if step else sex, kept_volume(model, betas)))
+            filled.append(filled_space(model, betas))
     print("Change of volume, %: whole body / segment around the joint\n")
     print("| bend | " + " | ".join(name for name, _ in columns) + " |")
     print("|---" * (len(columns) + 1) + "|")
@@ -174,6 +168,11 @@ def print_volume_table() -> None:
     for k, what in ((1, "whole"), (2, "segment")):
         row = max(worst[k - 1][1], key=lambda r: abs(r[k]))
         print(f"\nLargest change of the {what}: {row[k]:+.2f} % ({worst[k - 1][0]}, {row[0]})")
+    print("\nChange of the space filled (overlaps counted once), %\n")
+    print("| bend | " + " | ".join(name for name, _ in columns) + " |")
+    print("|---" * (len(columns) + 1) + "|")
+    for i, bend in enumerate(DEEP_BENDS):
+        print(f"| {bend} | " + " | ".join(f"{changes[i]:+.1f}" for changes in filled) + " |")
 
 
 def least_ms(call: Callable[[], object], repetitions: int) -> float:

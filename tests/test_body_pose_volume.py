@@ -3,11 +3,20 @@
 import numpy as np
 import pytest
 
-from benchmarks.body_pose import BENDS, closed_part, kept_volume, pose_of, posed, volume_of, weight_component
+from benchmarks.body_pose import (
+    BENDS,
+    kept_volume,
+    pose_of,
+    posed,
+    segment_of,
+    union_volume_m3,
+    weight_component,
+)
 from fit.body import BodyModel, load_body
 from fit.body.bends import flesh_bends
 from fit.body.flesh import Bone, Flesh, area_vectors
 from fit.body.sections import volume_m3
+from fit.body.segments import Segment
 from fit.body.skeleton import JOINT, axis_angle_to_matrix, blend_linearly, world_from_rest
 from fit.surface import vertex_normals
 
@@ -53,11 +62,11 @@ def test_heavy_and_thin_bodies_keep_it_in_single_bends(model: BodyModel) -> None
 
 def test_a_straight_pose_changes_no_part(model: BodyModel) -> None:
     for name, _, parts in BENDS:
-        faces, loops = closed_part(model, parts)
-        rest = volume_of(model.template, faces, loops)
+        segment = segment_of(model, parts)
+        rest = segment.volume_m3(model.template)
         assert rest > 0, name
         still = posed(model, model.template, pose_of({}))
-        assert volume_of(still, faces, loops) == pytest.approx(rest, rel=1e-9)
+        assert segment.volume_m3(still) == pytest.approx(rest, rel=1e-9)
 
 
 def test_a_side_of_the_trunk_stays_when_an_arm_goes_up(model: BodyModel) -> None:
@@ -78,6 +87,25 @@ def test_an_arm_goes_with_its_own_bones_alone(model: BodyModel) -> None:
     joints = model.joint_regressor @ model.template
     beyond = model.template[:, 0] > joints[JOINT["left_shoulder"], 0] + 0.12
     np.testing.assert_allclose(model.weights[beyond][:, arm].sum(1), 1, atol=1e-6)
+
+
+def test_a_rod_cut_in_two_gives_two_closed_halves(rod: tuple[np.ndarray, np.ndarray]) -> None:
+    vertices, faces = rod
+    left, right = (Segment.of(faces, side * vertices[:, 0] < 0.001) for side in (1, -1))
+    assert len(left.rims) == len(right.rims) == 1
+    whole = Segment.of(faces, np.ones(len(vertices), bool)).volume_m3(vertices)
+    assert whole == pytest.approx(volume_m3(vertices, faces), rel=1e-12)
+    assert left.volume_m3(vertices) == pytest.approx(whole / 2, rel=1e-9)
+    assert right.volume_m3(vertices) == pytest.approx(whole / 2, rel=1e-9)
+
+
+def test_space_filled_counts_an_overlap_once(rod: tuple[np.ndarray, np.ndarray]) -> None:
+    vertices, faces = rod
+    one = union_volume_m3(vertices, faces, 0.002)
+    assert one == pytest.approx(volume_m3(vertices, faces), rel=0.01)
+    both = np.concatenate([faces, faces + len(vertices)])
+    moved = np.concatenate([vertices, vertices + np.array([0.3, 0.0, 0.0])])  # half of it inside the first
+    assert union_volume_m3(moved, both, 0.002) == pytest.approx(1.5 * one, rel=0.01)
 
 
 def test_area_vectors_are_the_derivative_of_the_volume(rod: tuple[np.ndarray, np.ndarray]) -> None:

@@ -29,7 +29,7 @@ _HIP: tuple[dict[str, Turn], ...] = tuple(
     {"left_hip": turn}
     for turn in (
         (-35, 0, 0), (-70, 0, 0), (-110, 0, 0), (20, 0, 0), (0, 0, 35), (0, 0, -15), (0, 40, 0),
-        (0, -35, 0), (-90, 10, 25), (-60, -10, -10),
+        (0, -35, 0), (-90, 10, 25), (-105, 12, 16), (-60, -10, -10),
     )
 )  # fmt: skip
 _SHOULDER: tuple[dict[str, Turn], ...] = tuple(
@@ -48,12 +48,14 @@ _SHOULDER: tuple[dict[str, Turn], ...] = tuple(
 class Bend:
     """One settled example. rotations: every joint's own. skin: vertices; wanted: where they go, m; swell: the
     way they would give (unit normals of the posed skin, fading out away from the joint and in creases).
+    combined: a hip that turns about several axes, as in squats, where the volume of the whole matters most.
     """
 
     rotations: Float[np.ndarray, "24 3 3"]
     skin: Int[np.ndarray, "r"]
     wanted: Float[np.ndarray, "r 3"]
     swell: Float[np.ndarray, "r 3"]
+    combined: bool = False
 
 
 def flesh_bends(
@@ -98,7 +100,8 @@ def flesh_bends(
             fade = smooth_step(-reach_m, -0.4 * reach_m, -np.linalg.norm(whole - at(crease), axis=1))
             fade = fade[flesh.region] * flesh.free_of_crease(wanted, half_turn) * flesh.softness
             swell = fade[:, None] * vertex_normals(whole, faces)[flesh.region]
-            bends.append(Bend(rotations, flesh.region, wanted, swell))
+            combined = crease == "left_hip" and int(np.count_nonzero(pose[JOINT[crease]])) > 1
+            bends.append(Bend(rotations, flesh.region, wanted, swell, combined))
         return bends
 
     elbow = Flesh(
@@ -157,7 +160,7 @@ def plain_bends(
     for axis in range(3):
         for limit in (prior.low, prior.high):
             pose = np.zeros((N_JOINTS, 3))
-            pose[joint, axis] = 0.9 * limit[3 * (joint - 1) + axis]
+            pose[joint, axis] = 0.75 * limit[3 * (joint - 1) + axis]
             rotations = axis_angle_to_matrix(pose)
             bones = world_from_rest(rotations, joints)
             whole = blend_dual_quaternions(vertices, weights, bones)

@@ -21,7 +21,7 @@ from fit.surface import vertex_areas
 from . import half_mesh
 from .anatomy import make_person
 from .anthropometry import measure
-from .correctives import fit_pose_correctives
+from .correctives import Build, fit_pose_correctives
 from .correspondence import Carrier
 from .joint_regressor import fit_joint_regressor
 from .local_variation import local_components
@@ -29,7 +29,7 @@ from .model import BodyModel, BodyModelError
 from .parts import body_25_regressor, part_labels, region_mask
 from .ramp import smooth_step
 from .remesh import SEAM_TOLERANCE_M
-from .shape_space import N_ANTHROPOMETRIC, gather_people, principal_components
+from .shape_space import N_ANTHROPOMETRIC, gather_people, principal_components, weight_component
 from .skeleton import JOINT, PARENTS
 from .skin_weights import make_skin_weights
 from .smooth_variation import smooth_components
@@ -40,6 +40,7 @@ N_COMPONENTS = 176
 AMPLITUDE = {"torso": 1.1, "leg": 0.95, "arm": 1.0, "neck": 1.0}
 """Standard deviation of smooth variation by region, relative; elsewhere OTHER_AMPLITUDE."""
 OTHER_AMPLITUDE = 0.6
+WEIGHTS_SD = (-2.0, 2.0)  # the thin and the heavy body whose volume the correctives keep besides the mean's
 N_PEOPLE = 360
 N_PEOPLE_FOR_JOINTS = 120
 DECIMALS = 9  # of the stored arrays: a nanometre, so that a last bit of some BLAS does not change the hash
@@ -49,7 +50,7 @@ GENERATOR = (
     "correspondence.py", "density.py", "dual_quaternions.py", "flesh.py", "foot.py", "girth_solver.py",
     "half_mesh.npz", "half_mesh.py", "hand.py", "head.py", "implicit.py", "implicit_relief.py",
     "implicit_tape.py", "joint_regressor.py", "limbs.py", "local_variation.py", "parts.py", "plan.py",
-    "pose_prior.py", "ramp.py", "remesh.py", "sections.py", "shape_space.py", "skeleton.py",
+    "pose_prior.py", "ramp.py", "remesh.py", "sections.py", "segments.py", "shape_space.py", "skeleton.py",
     "skin_weights.py", "smooth_variation.py", "stations.py", "tape.py", "trunk.py", "../surface.py",
 )  # fmt: skip
 
@@ -132,7 +133,11 @@ def build(
     n_smooth = N_COMPONENTS - known.shape[2]
     smooth = smooth_components(template, faces, _smooth_amplitude(parts), held, partner, known, n_smooth)
     progress()
-    correctives = fit_pose_correctives(template, faces, weights, joints, partner)
+    heavier = anthropometric[:, :, weight_component(template, anthropometric, faces)]
+    others = tuple(
+        Build(template + step * heavier, regressor @ (template + step * heavier)) for step in WEIGHTS_SD
+    )
+    correctives = fit_pose_correctives(template, faces, weights, joints, partner, others)
     progress()
     return BodyModel(
         name=f"free:{sex_name}",

@@ -10,11 +10,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .anatomy import make_person
 from .anthropometry import GIRTHS, draw_people, measure
 from .correspondence import Carrier
+from .sections import volume_m3
 from .skeleton import JOINT
 
 N_ANTHROPOMETRIC = 40
@@ -85,3 +86,21 @@ def principal_components(
             vectors[:, b] *= -1
     components = np.einsum("nb,nvc->vcb", vectors, centred) / np.sqrt(n - 1)
     return mean, components, variance[:n_components] / variance.sum()
+
+
+def weight_component(
+    template: Float[np.ndarray, "v 3"],
+    shape_directions: Float[np.ndarray, "v 3 b"],
+    faces: Int[np.ndarray, "f 3"],
+) -> int:
+    """The component, among the first ten, that changes volume most at a given stature: what a person would
+    call weight.
+    """
+    change = []
+    for k in range(min(shape_directions.shape[2], 10)):
+        ratio = []
+        for step in (-2, 2):
+            v = template + step * shape_directions[:, :, k]
+            ratio.append(volume_m3(v, faces) / np.ptp(v[:, 1]) ** 3)
+        change.append(abs(np.log(ratio[1] / ratio[0])))
+    return int(np.argmax(change))
