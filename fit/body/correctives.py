@@ -160,7 +160,7 @@ def _swelling(
     group: tuple[int, ...],
     bends: list[Bend],
     moves: Float[np.ndarray, "b n 3 k"],
-) -> Float[np.ndarray, "2*b"]:
+) -> Float[np.ndarray, "s"]:
     """How far (m) the skin must swell in each bend, first that of the segment, then that beside it, for all
     bodies to keep their volume: of the whole, and of the segment around the joints.
     """

@@ -21,7 +21,7 @@ class Segment:
     """
 
     faces: Int[np.ndarray, "f 3"]
-    rims: tuple[Int[np.ndarray, "n"], ...]
+    rims: tuple[Int[np.ndarray, "_"], ...]
 
     @staticmethod
     def of(faces: Int[np.ndarray, "g 3"], inside: Bool[np.ndarray, "v"]) -> "Segment":
@@ -40,7 +40,7 @@ class Segment:
         ]
         return Segment(np.concatenate([own, *fans]), tuple(rim[label == k, 0] for k in names))
 
-    def closed(self, vertices: Float[np.ndarray, "v *k"]) -> Float[np.ndarray, "w *k"]:
+    def closed(self, vertices: Float[np.ndarray, "v *k"]) -> Float[np.ndarray, "_ *k"]:
         """The vertices (or anything linear in them, their moves) and behind them the centres of the rims."""
         return np.concatenate([vertices, *(vertices[rim].mean(0)[None] for rim in self.rims)])
 
