@@ -62,7 +62,7 @@ class FitSettings:
     align_pose: tuple[StageWeights, ...] = (StageWeights(cloth=False, sigma_m=0.05),)
     #: The pose alone moves with only so many of the first coefficients (measured and named ones of the
     #: free body): the smooth ones would follow folds before the limbs lie right, and cost time.
-    pose_betas: int = 60
+    pose_betas: int = 68
     align_joint: tuple[StageWeights, ...] = (
         StageWeights(cloth=False, sigma_m=0.05, coupling=1.0, tether=1e-2),
     )

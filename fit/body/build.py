@@ -35,7 +35,7 @@ from .skin_weights import make_skin_weights
 from .smooth_variation import smooth_components
 
 SEX_COORDINATE: dict[str, float | None] = {"neutral": None, "female": 0.0, "male": 1.0}
-N_COMPONENTS = 176
+N_COMPONENTS = 184
 """Of the shape space: people's principal components, then named local ones, then smooth ones."""
 AMPLITUDE = {"torso": 1.1, "leg": 0.95, "arm": 1.0, "neck": 1.0}
 """Standard deviation of smooth variation by region, relative; elsewhere OTHER_AMPLITUDE."""

@@ -177,7 +177,7 @@ COMPONENTS: dict[str, Maker] = {
     "thigh inner": _limb(5.0, "left_hip", "left_knee", 0.30, 0.30, (-1.0, 0.0, 0.0)),
     "thigh outer": _limb(6.0, "left_hip", "left_knee", 0.30, 0.35, OUT),
     "thigh front": _limb(5.0, "left_hip", "left_knee", 0.45, 0.35, FRONT),
-    "thigh back": _limb(7.0, "left_hip", "left_knee", 0.45, 0.35, BACK),
+    "thigh back": _limb(8.0, "left_hip", "left_knee", 0.45, 0.35, BACK),
     "knee": _limb(3.0, "left_hip", "left_knee", 1.0, 0.18),
     "calf": _limb(4.0, "left_knee", "left_ankle", 0.30, 0.25, BACK),
     "calf height": _limb_shifted(3.0, "left_knee", "left_ankle", 0.35, 0.25, BACK),
