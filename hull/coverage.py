@@ -2,8 +2,8 @@
 
 Seen from a camera, the faces that look at it are bounded by the edges whose other face looks away. Drawn as a
 signed outline, that boundary winds once around a pixel's centre for every layer of the surface that covers
-it; so a picture costs a few thousand edges and a running sum along its rows, where casting a ray through every
-pixel costs millions of rays.
+it; so a picture costs a few thousand edges and a running sum along its rows, where casting a ray through
+every pixel costs millions of rays.
 """
 
 from __future__ import annotations
