@@ -6,7 +6,7 @@ import platform
 import sys
 import time
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -20,6 +20,7 @@ from bodyhull.folder import RunFolder, write_atomically
 from bodyhull.look_ahead import silhouettes_ahead
 from capture.recording import Recording, Silhouettes, open_recording
 from hull.bounds import Bounds
+from hull.colours import vertex_colours
 from hull.errors import HullError
 from hull.faults import CameraFault
 from hull.hull_file import facts_file, load_hull, save_hull
@@ -166,7 +167,7 @@ def carve_stage(config: RunConfig) -> Recording:
     near: Bounds | None = None
     with silhouettes_ahead(recording.silhouettes, todo) as ahead:
         for silhouettes in tqdm(ahead, total=len(todo), desc="carve", unit="frame", disable=not todo):
-            carved, near = carve_frame(recording, folder, silhouettes, config.voxel_mm, near)
+            carved, near = carve_frame(recording, folder, silhouettes, config.voxel_mm, near, config.colours)
             frames[f"{carved.frame_id:06d}"] = carved.as_dict()
             folder.update_stage("hull", frames=frames)
     if todo:
@@ -208,7 +209,12 @@ def _carved(folder: RunFolder, frame_id: int, known: dict[str, Any]) -> bool:
 
 
 def carve_frame(
-    recording: Recording, folder: RunFolder, silhouettes: Silhouettes, voxel_mm: float, near: Bounds | None
+    recording: Recording,
+    folder: RunFolder,
+    silhouettes: Silhouettes,
+    voxel_mm: float,
+    near: Bounds | None,
+    colours: bool = True,
 ) -> tuple[CarvedFrame, Bounds | None]:
     """Carve one frame and write its hull; a frame that cannot be carved comes back marked.
 
@@ -228,6 +234,15 @@ def carve_frame(
     for fault in hull.faults:
         tqdm.write(f"warning: frame {frame_id:06d}: {fault.sentence()}", file=sys.stderr)
     agreement = silhouette_agreement(hull.vertices, hull.faces, recording.rig, silhouettes.images)
+    if colours:
+        rgb = vertex_colours(
+            hull.vertices,
+            hull.faces,
+            hull.normals,
+            recording.rig.cameras,
+            lambda camera_idx: recording.picture(camera_idx, frame_id),
+        )
+        hull = replace(hull, colours=rgb)
     path = folder.hull(frame_id)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_hull(path, hull)

@@ -49,6 +49,8 @@ class RunConfig:
     """Redo what this run folder already holds."""
     pose_prior: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Pose prior to use instead of the built-in one: an .npz with mean (69) and covariance (69 x 69), rad."""
+    colours: bool = True
+    """Colour the hulls from the pictures, where the recording has any."""
 
     def carve_settings(self) -> dict[str, object]:
         """What the hulls depend on, besides the files' contents."""

@@ -66,6 +66,14 @@ class RayScene:
         rays = self._rays(origin, points - origin)
         return self._scene.test_occlusions(_as_tensor(rays), nthreads=self._n_threads).numpy()
 
+    def hides(
+        self, starts: Float[np.ndarray, "n 3"], ways: Float[np.ndarray, "n 3"]
+    ) -> Bool[np.ndarray, " n"]:
+        """(N,) whether the surface stands between each start (N 3) and the end of its way (N 3, metres)."""
+        rays = _as_tensor(self._rays(starts, ways))
+        # The way's length is the unit, so that nothing beyond its end counts.
+        return self._scene.test_occlusions(rays, tnear=0.0, tfar=1.0, nthreads=self._n_threads).numpy()
+
     def first_hits(
         self, starts: Float[np.ndarray, "n 3"], ways: Float[np.ndarray, "n 3"]
     ) -> Float[np.ndarray, " n"]:

@@ -18,6 +18,8 @@ FUNCTIONS = {
     "hull.mesh_file.save_mesh": "path vertices faces normals",
     "hull.mesh_file.load_mesh": "path",
     "hull.hull_file.save_hull": "path hull",
+    "hull.colours.vertex_colours": "vertices faces normals cameras picture_of",
+    "hull.quality.contour_distance": "vertices faces rig images",
     "hull.hull_file.load_hull": "path",
     "fit.body.load_body": "spec",
     "fit.body.body_file.read_body_file": "path",
@@ -54,7 +56,7 @@ FIELDS = {
     "render.report.ReportData": "title subtitle headline problems facts pictures tables sheet_headers sheet "
     "films",
     "bodyhull.config.RunConfig": "recording out sequence body calibration frames voxel_mm units up "
-    "background keypoints overwrite pose_prior",
+    "background keypoints overwrite pose_prior colours",
 }
 METHODS = {
     "capture.camera.Camera": "project unproject rays pinhole undistort_image with_world_scaled "
