@@ -10,10 +10,13 @@ import json
 import os
 import zipfile
 import zlib
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from hull.fault_kinds import CameraFault, FaultAction, FaultKind
 from hull.mesh_file import MeshFileError, load_colours, load_mesh, load_normals, save_mesh
 from hull.visual_hull import Hull
 
@@ -46,6 +49,7 @@ def save_hull(path: Path | str, hull: Hull) -> None:
                 stream,
                 checksum=np.int64(_checksum(hull.vertices)),
                 problems=np.array(json.dumps(list(hull.problems))),
+                faults=np.array(json.dumps([asdict(fault) for fault in hull.faults])),
                 **{name: getattr(hull, name).astype(kind) for name, kind in _KINDS.items()},
             )
         temporary.replace(facts_file(path))
@@ -68,6 +72,7 @@ def load_hull(path: Path | str) -> Hull:
         with beside.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             found = {name: archive[name] for name in archive.files}
         problems = tuple(json.loads(str(found["problems"])))
+        faults = tuple(_fault(values) for values in json.loads(str(found["faults"])))
         checksum = int(found["checksum"])
         facts = {name: found[name] for name in _KINDS}
     except FileNotFoundError as error:
@@ -87,7 +92,14 @@ def load_hull(path: Path | str) -> Hull:
         is_phantom=facts["is_phantom"].astype(bool),
         colours=load_colours(path),
         problems=problems,
+        faults=faults,
     )
+
+
+def _fault(values: dict[str, Any]) -> CameraFault:
+    moved = values["moved_px"]
+    given = values | {"kind": FaultKind(values["kind"]), "action": FaultAction(values["action"])}
+    return CameraFault(**(given | {"moved_px": None if moved is None else tuple(moved)}))
 
 
 def _checksum(vertices: np.ndarray) -> int:

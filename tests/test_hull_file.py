@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from capture.layouts import dome_layout
+from hull.fault_kinds import CameraFault, FaultAction, FaultKind
 from hull.hull_file import facts_file, load_hull, save_hull
 from hull.mesh_file import MeshFileError, save_mesh
 from hull.visual_hull import Hull, build_hull
@@ -20,7 +21,11 @@ def hull() -> Hull:
     rig = dome_layout(6, (96, 96))
     made = build_hull(rig, ball().silhouettes(rig), 0.05)
     colours = np.random.default_rng(0).integers(0, 256, made.vertices.shape).astype(np.uint8)
-    return replace(made, colours=colours, problems=("one", "two, with ünïcode"))
+    faults = (
+        CameraFault(2, "cam2", FaultKind.MOVED, FaultAction.LEFT_OUT, 0.1, 0.2, (10.0, -0.5)),
+        CameraFault(4, "cam4", FaultKind.PART_MISSING, FaultAction.REGION_UNKNOWN, 1 / 3),
+    )
+    return replace(made, colours=colours, problems=("one", "two, with ünïcode"), faults=faults)
 
 
 def test_what_is_saved_comes_back(hull: Hull, tmp_path: Path) -> None:

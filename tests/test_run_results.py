@@ -2,19 +2,22 @@
 
 import json
 import re
+from pathlib import Path
 
 import av
 import numpy as np
 import pytest
 
 from bodyhull.config import RunConfig
-from bodyhull.folder import load_arrays
+from bodyhull.folder import RunFolder, load_arrays
 from capture.rig import Rig
 from fit.body.model import load_body
 from fit.body.skeleton import axis_angle_to_matrix
 from fit.closest import closest_points
 from fit.frames import apply
+from hull.hull_file import load_hull
 from hull.mesh_file import load_mesh
+from tests.command_line import call
 from tests.tiny_run import BLIND, DEGRADED, FAILED, GOOD, N_CAMERAS, SIZE, VOXEL_MM, TinyRun
 
 FITTED = (*GOOD, DEGRADED)
@@ -38,6 +41,27 @@ def test_the_files_that_other_programs_rely_on(tiny: TinyRun) -> None:
     wanted |= {f"fit/alignments/{k:06d}.npz" for k in FITTED}
     wanted |= {f"render/overlay/{name}.mp4" for name in CAMERAS} | {"render/report.html"}
     assert set(tiny.times()) == wanted
+
+
+def test_hulls_carry_the_colours_of_the_pictures_unless_told_not_to(
+    tiny: TinyRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    hull = load_hull(tiny.folder.hull(GOOD[0]))
+    assert hull.colours is not None and hull.colours.std(axis=0).min() > 5
+    said = call(
+        capsys,
+        "carve",
+        tiny.recording,
+        "--out",
+        tmp_path,
+        "--voxel-mm",
+        30,
+        "--frames",
+        "0:1",
+        "--no-colours",
+    )
+    assert said.code == 0, said.err
+    assert load_hull(RunFolder(tmp_path).hull(0)).colours is None
 
 
 def test_a_failed_frame_is_kept_marked_and_does_not_stop_the_others(tiny: TinyRun) -> None:
