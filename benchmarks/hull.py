@@ -1,10 +1,12 @@
-"""How fast hulls are carved, and how exactly, beside open3d's voxel carving. Prints a Markdown table.
+"""How fast hulls are carved, and how exactly, beside open3d's voxel carving. Prints Markdown tables.
 
-    python -m benchmarks.hull                       # 16 cameras of 1 MP, a cube of 256^3 voxels (7.8 mm)
-    python -m benchmarks.hull --cameras 68 --side-px 2048 --voxels 512
+    python -m benchmarks.hull            # all tables; half an hour on two cores
+    python -m benchmarks.hull --quick    # 16 cameras of 1 MP in a cube of 256^3 voxels, open3d beside it
 
 Every row runs in a process of its own, on one thread, and reports its processor time (the least of the
-repetitions) and the peak of its memory. The subject is a figure of capsules, 1.75 m tall, in a cube of 2 m.
+repetitions) and how much its memory rose above what the silhouettes take. The subject is a figure of
+capsules, 1.75 m tall, in a cube of 2 m. What other programs do on the machine makes every row slower, and
+large rows more than small ones.
 """
 
 from __future__ import annotations
@@ -13,22 +15,31 @@ import argparse
 import multiprocessing
 import os
 import platform
+import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from capture.layouts import dome_layout
+from capture.recording import open_recording
 from capture.rig import Rig
 from hull.bounds import Bounds, bounds_from_tables
 from hull.carve import Grid, carve
+from hull.cleaning import is_closed, keep_what_matters, vertex_normals
+from hull.culling import Culling
 from hull.diagnosis import inside_by_definition
+from hull.marching import binary_surface
 from hull.quality import silhouette_agreement
 from hull.rays import RayScene
-from hull.tables import prepare_tables
-from hull.visual_hull import build_hull
+from hull.ridges import raise_ridges
+from hull.surface import cross_exactly
+from hull.tables import SilhouetteTable, prepare_tables
+from hull.visual_hull import HullOptions, build_hull, grid_over
 from hull.witnesses import witness_rule
 
 CUBE_LOW, CUBE_M = np.array([-1.0, -1.0, -0.1]), 2.0
@@ -76,14 +87,32 @@ def silhouettes(rig: Rig) -> list[np.ndarray]:
     return [np.where(scene.mask(camera), 255, 0).astype(np.uint8) for camera in rig]
 
 
+@dataclass(frozen=True)
+class Settings:
+    """What a row works on; `images_at`: the silhouettes, made once for all rows."""
+
+    n_cameras: int
+    side_px: int
+    n_voxels: int
+    images_at: Path
+
+
 class Case:
     """The recording that every row works on."""
 
-    def __init__(self, n_cameras: int, side_px: int, n_voxels: int, images_at: Path) -> None:
-        self.rig = dome_layout(n_cameras, (side_px, side_px))
-        self.images = list(np.load(images_at))
-        self.n_voxels = n_voxels
-        self.grid = Grid(CUBE_LOW, CUBE_M / n_voxels, (n_voxels, n_voxels, n_voxels))
+    def __init__(self, settings: Settings) -> None:
+        self.rig = dome_layout(settings.n_cameras, (settings.side_px, settings.side_px))
+        self.images = list(np.load(settings.images_at))
+        self.n_voxels = settings.n_voxels
+        self.voxel_m = CUBE_M / settings.n_voxels
+        self.grid = Grid(CUBE_LOW, self.voxel_m, (settings.n_voxels,) * 3)
+
+    @property
+    def repetitions(self) -> int:
+        return 1 if self.n_voxels > 512 else 3
+
+
+Row = Callable[[Case, list[float]], str]
 
 
 @contextmanager
@@ -106,6 +135,16 @@ def row_bounds(case: Case, seconds: list[float]) -> str:
         with timed(seconds):
             bounds = bounds_from_tables(tables)
     return "box " + " x ".join(f"{s:.2f}" for s in bounds.size_m) + " m"
+
+
+def row_bounds_near(case: Case, seconds: list[float]) -> str:
+    tables = prepare_tables(case.rig, case.images)
+    whole = bounds_from_tables(tables)
+    for _ in range(3):
+        with timed(seconds):
+            bounds = bounds_from_tables(tables, near=whole)
+    same = np.array_equal(bounds.low, whole.low) and np.array_equal(bounds.high, whole.high)
+    return "the same box" if same else "ANOTHER BOX"
 
 
 def row_carve(case: Case, seconds: list[float]) -> str:
@@ -132,21 +171,91 @@ def row_exact(case: Case, seconds: list[float]) -> str:
     return f"{different} voxels different from the adaptive carve"
 
 
-def row_hull(case: Case, seconds: list[float]) -> str:
-    for _ in range(3):
-        with timed(seconds):
-            hull = build_hull(case.rig, case.images, CUBE_M / case.n_voxels)
-    scores = silhouette_agreement(hull.vertices, hull.faces, case.rig, case.images)
-    return f"{len(hull.vertices)} vertices, agreement worst {scores.min():.4f}, mean {scores.mean():.4f}"
+def refined_mesh(
+    tables: Sequence[SilhouetteTable], voxel_m: float, bounds: Bounds | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces as `build_hull` makes them, without the search for faults and vertices' facts."""
+    bounds = bounds_from_tables(tables) if bounds is None else bounds
+    grid = grid_over(bounds, voxel_m)
+    surface = binary_surface(carve(tables, witness_rule(tables, bounds.centre), grid))
+    culling = Culling(tables, grid)
+    crossings = cross_exactly(surface, grid, tables, culling)
+    normals = vertex_normals(crossings.vertices, surface.faces, n_rings=1)
+    crossings, faces = raise_ridges(crossings, surface.faces, normals, tables, voxel_m, culling)
+    kept, faces, _ = keep_what_matters(crossings.vertices, faces, tables)
+    vertices = crossings.vertices[kept]
+    assert is_closed(faces, len(vertices))
+    vertex_normals(vertices, faces)
+    return vertices, faces
 
 
-def row_hull_in_cube(case: Case, seconds: list[float]) -> str:
-    for _ in range(3):
+def row_mesh(case: Case, seconds: list[float]) -> str:
+    for _ in range(case.repetitions):
         with timed(seconds):
-            hull = build_hull(
-                case.rig, case.images, CUBE_M / case.n_voxels, Bounds(CUBE_LOW, CUBE_LOW + CUBE_M)
-            )
-    return f"{len(hull.vertices)} vertices"
+            vertices, faces = refined_mesh(prepare_tables(case.rig, case.images), case.voxel_m)
+    scores = silhouette_agreement(vertices, faces, case.rig, case.images)
+    return f"{len(vertices)} vertices, agreement worst {scores.min():.4f}, mean {scores.mean():.4f}"
+
+
+def row_surface(case: Case, seconds: list[float]) -> str:
+    """What depends on the voxels: no tables, no search for the box."""
+    tables = prepare_tables(case.rig, case.images)
+    bounds = bounds_from_tables(tables)
+    for _ in range(case.repetitions):
+        with timed(seconds):
+            vertices, _ = refined_mesh(tables, case.voxel_m, bounds)
+    return f"{len(vertices)} vertices"
+
+
+def row_faults(case: Case, seconds: list[float]) -> str:
+    for _ in range(case.repetitions):
+        with timed(seconds):
+            hull = build_hull(case.rig, case.images, case.voxel_m)
+    return f"{len(hull.faults)} faults"
+
+
+def row_facts(case: Case, seconds: list[float]) -> str:
+    options = HullOptions(find_faults=False)
+    for _ in range(case.repetitions):
+        with timed(seconds):
+            hull = build_hull(case.rig, case.images, case.voxel_m, options=options)
+    return f"median slack {1000 * float(np.median(hull.slack_m)):.0f} mm"
+
+
+def row_agreement(case: Case, seconds: list[float]) -> str:
+    vertices, faces = refined_mesh(prepare_tables(case.rig, case.images), case.voxel_m)
+    for _ in range(2):
+        with timed(seconds):
+            silhouette_agreement(vertices, faces, case.rig, case.images)
+    return "told for every frame of a run"
+
+
+def row_read(case: Case, seconds: list[float]) -> str:
+    return _from_files(case, seconds, with_hull=False)
+
+
+def row_from_files(case: Case, seconds: list[float]) -> str:
+    return _from_files(case, seconds, with_hull=True)
+
+
+def _from_files(case: Case, seconds: list[float], with_hull: bool) -> str:
+    with tempfile.TemporaryDirectory() as name:
+        root, size = Path(name), 0
+        case.rig.save(root / "rig.json")
+        for camera, image in zip(case.rig, case.images, strict=True):
+            path = root / "SilhouettesPictures" / camera.name / "silh_000000.png"
+            path.parent.mkdir(parents=True)
+            cv2.imwrite(str(path), image)
+            size += path.stat().st_size
+        case.images = []
+        recording = open_recording(root, calibration=root / "rig.json", units="m", up="z")
+        for _ in range(case.repetitions):
+            with timed(seconds):
+                silhouettes = recording.silhouettes(0)
+                if with_hull:
+                    refined_mesh(prepare_tables(recording.rig, silhouettes.images), case.voxel_m)
+    assert not silhouettes.problems
+    return f"{size / len(case.rig.cameras) / 1000:.0f} kB a file, 8 bits"
 
 
 def row_open3d_grid(case: Case, seconds: list[float]) -> str:
@@ -184,12 +293,13 @@ def _open3d_dense(case: Case):  # type: ignore[no-untyped-def]  # open3d ships n
     )
 
 
-def _measure(row: Callable[[Case, list[float]], str], settings: tuple, queue) -> None:  # type: ignore[no-untyped-def,type-arg]
-    case = Case(*settings)
+def _measure(row: Row, settings: Settings, queue) -> None:  # type: ignore[no-untyped-def]
+    cv2.setNumThreads(1)
+    case = Case(settings)
     seconds: list[float] = []
     before = _reset_peak_mb()
     remark = row(case, seconds)
-    queue.put((min(seconds), _status_mb("VmHWM") - before, remark))
+    queue.put((min(seconds), status_mb("VmHWM") - before, remark))
 
 
 def _reset_peak_mb() -> float:
@@ -198,10 +308,11 @@ def _reset_peak_mb() -> float:
     if not clear.exists():
         return float("nan")
     clear.write_text("5")
-    return _status_mb("VmRSS")
+    return status_mb("VmRSS")
 
 
-def _status_mb(name: str) -> float:
+def status_mb(name: str) -> float:
+    """A figure of this process from /proc (VmRSS: held now, VmHWM: the most), MB."""
     status = Path("/proc/self/status")
     if not status.exists():
         return float("nan")
@@ -226,48 +337,93 @@ def machine() -> str:
     return f"{model}, {os.cpu_count()} cores{load}; numpy {np.__version__}, open3d {open3d.__version__}"
 
 
+def measured(name: str, row: Row, settings: Settings) -> tuple[float, float]:
+    """Run a row in a process of its own and print its line; its seconds and MB."""
+    spawn = multiprocessing.get_context("spawn")
+    queue = spawn.Queue()
+    process = spawn.Process(target=_measure, args=(row, settings, queue))
+    process.start()
+    process.join()
+    if process.exitcode:
+        print(f"| {name} | failed | | |", flush=True)
+        return float("nan"), float("nan")
+    seconds, memory, remark = queue.get()
+    print(f"| {name} | {seconds:.3f} | {memory:.0f} | {remark} |", flush=True)
+    return seconds, memory
+
+
+def table(title: str) -> None:
+    print(f"\n{title}\n\n| what | processor s | memory MB | |\n| --- | --- | --- | --- |", flush=True)
+
+
+def made(folder: Path, n_cameras: int, side_px: int, n_voxels: int) -> Settings:
+    """Settings whose silhouettes lie in `folder`."""
+    images_at = folder / f"{n_cameras}_{side_px}.npy"
+    if not images_at.exists():
+        np.save(images_at, np.stack(silhouettes(dome_layout(n_cameras, (side_px, side_px)))))
+    return Settings(n_cameras, side_px, n_voxels, images_at)
+
+
+def beside_open3d(folder: Path) -> None:
+    """256^3 voxels, 16 x 1 MP: the ratio, the memory, and equality with the plain definition."""
+    settings = made(folder, 16, 1024, 256)
+    table("16 cameras of 1024 x 1024, 7.8 mm; first rows: a cube of 256^3 voxels")
+    ours, memory = measured("tables + adaptive carve", row_carve, settings)
+    measured("every centre in every camera", row_exact, settings)
+    dense, _ = measured("open3d create_dense", row_open3d_grid, settings)
+    theirs, _ = measured("open3d carve_silhouette", row_open3d_carve, settings)
+    ratio = (dense + theirs) / ours
+    print(f"| open3d over ours | {ratio:.0f} times | {memory:.0f} MB for ours | bar: 100 times, 300 MB |")
+    phases(settings)
+
+
+def phases(settings: Settings) -> None:
+    """One frame, from masks and from files."""
+    measured("tables", row_tables, settings)
+    measured("bounds, all of space searched", row_bounds, settings)
+    measured("bounds, near the last frame's", row_bounds_near, settings)
+    mesh, _ = measured("masks to refined mesh", row_mesh, settings)
+    facts, _ = measured("the same with the vertices' facts", row_facts, settings)
+    faults, _ = measured("build_hull: the same with the search for faults", row_faults, settings)
+    measured("reading the PNG files", row_read, settings)
+    measured("PNG files to refined mesh", row_from_files, settings)
+    measured("agreement with the silhouettes", row_agreement, settings)
+    print(f"\nmesh {mesh:.2f} s, facts {facts - mesh:+.2f} s, faults {faults - facts:+.2f} s", flush=True)
+
+
+def by_voxel(folder: Path) -> None:
+    """Halving the voxel: surface, not volume."""
+    table("68 cameras of 2048 x 2048, halving the voxel: carve and surface, tables and box given")
+    last = None
+    for n_voxels in (125, 250, 500, 1000):
+        settings = made(folder, 68, 2048, n_voxels)
+        found = measured(f"{2000 / n_voxels:g} mm", row_surface, settings)
+        if last is not None:
+            print(
+                f"| &nbsp; ratio | {found[0] / last[0]:.2f} | {found[1] / last[1]:.2f} | bar: 4.5 |",
+                flush=True,
+            )
+        last = found
+
+
 def main() -> None:
     # The rows' processes inherit this.
     os.environ.update({f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")})
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--cameras", type=int, default=16)
-    parser.add_argument("--side-px", type=int, default=1024)
-    parser.add_argument("--voxels", type=int, default=256)
-    parser.add_argument("--no-open3d", action="store_true")
+    parser.add_argument("--quick", action="store_true", help="16 cameras of 1 MP only")
     options = parser.parse_args()
+    print(machine())
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        beside_open3d(folder)
+        if options.quick:
+            return
+        table("68 cameras of 2048 x 2048, 3.9 mm")
+        phases(made(folder, 68, 2048, 512))
+        by_voxel(folder)
+        from benchmarks.hull_long_run import long_run
 
-    import tempfile
-
-    rows: list[tuple[str, Callable[[Case, list[float]], str]]] = [
-        ("tables", row_tables),
-        ("tables + adaptive carve", row_carve),
-        ("bounds", row_bounds),
-        ("whole hull in the cube, from masks", row_hull_in_cube),
-        ("whole hull, bounds found, from masks", row_hull),
-    ]
-    if options.voxels <= 256:
-        rows.append(("every centre in every camera", row_exact))
-        if not options.no_open3d:
-            rows += [("open3d create_dense", row_open3d_grid), ("open3d carve_silhouette", row_open3d_carve)]
-    rig = dome_layout(options.cameras, (options.side_px, options.side_px))
-    size = f"{options.side_px} x {options.side_px}"
-    print(f"{options.cameras} cameras of {size}, {options.voxels}^3 voxels\n{machine()}\n")
-    print("| what | processor s | memory MB | |\n| --- | --- | --- | --- |")
-    spawn = multiprocessing.get_context("spawn")
-    with tempfile.TemporaryDirectory() as folder:
-        images_at = Path(folder) / "silhouettes.npy"
-        np.save(images_at, np.stack(silhouettes(rig)))
-        settings = (options.cameras, options.side_px, options.voxels, images_at)
-        for name, row in rows:
-            queue = spawn.Queue()
-            process = spawn.Process(target=_measure, args=(row, settings, queue))
-            process.start()
-            process.join()
-            if process.exitcode:
-                print(f"| {name} | failed | | |")
-                continue
-            seconds, memory, remark = queue.get()
-            print(f"| {name} | {seconds:.3f} | {memory:.0f} | {remark} |", flush=True)
+        long_run(folder)
 
 
 if __name__ == "__main__":
