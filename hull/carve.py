@@ -133,7 +133,7 @@ def carve(tables: Sequence[SilhouetteTable], rule: WitnessRule, grid: Grid, vote
     chosen = _ask_voxels(tables, rule, front, within, grid.centres(cells), votes, order)
     found.append(cells[:, chosen])
     found = found[::-1]
-    _cut_at_the_grid(found, grid)
+    cut_at_the_grid(found, grid)
     return Blocks(grid, tuple(found))
 
 
@@ -293,7 +293,7 @@ def _ask_voxels(
     return np.flatnonzero(alive)
 
 
-def _cut_at_the_grid(cells: list[np.ndarray], grid: Grid) -> None:
+def cut_at_the_grid(cells: list[np.ndarray], grid: Grid) -> None:
     """Cubes that reach over the grid's far sides are replaced by their voxels inside it (in place)."""
     shape = np.array(grid.shape)[:, None]
     for level in range(len(cells) - 1, 0, -1):

@@ -23,7 +23,7 @@ _MOST_HALVED = 128.0
 # Then to a hundredth of a pixel.
 _N_FALSE_POSITIONS = 3
 # Crossings keep this share of the edge from its ends, so that no triangle collapses onto a grid point.
-_KEEP_OFF = 0.02
+KEEP_OFF = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ def cross_exactly(
     # Where no camera refuses the far end, it was given up for want of witnesses: nobody knows better than
     # half way.
     exit_at[cut_by < 0] = 0.5
-    return Crossings((origin + along * np.clip(exit_at, _KEEP_OFF, 1.0 - _KEEP_OFF)).T, cut_by)
+    return Crossings((origin + along * np.clip(exit_at, KEEP_OFF, 1.0 - KEEP_OFF)).T, cut_by)
 
 
 def exits(
@@ -93,7 +93,7 @@ def exits(
         if not len(refused):
             continue
         start, way = origin.take(refused, axis=1), along.take(refused, axis=1)
-        share = _way_out(table, table.projected(start), table.projected_way(way), exit_at[refused])
+        share = way_out(table, table.projected(start), table.projected_way(way), exit_at[refused])
         cut_by[refused] = table_idx
         exit_at[refused] = share
         place[:, refused] = start + way * share
@@ -133,7 +133,7 @@ def _exits_by_votes(
         if not len(refused):
             continue
         start, way = origin[:, refused], along[:, refused]
-        at = _way_out(table, table.projected(start), table.projected_way(way), refused_at[-1, refused])
+        at = way_out(table, table.projected(start), table.projected_way(way), refused_at[-1, refused])
         # One of the votes may be cast at the start already.
         at[table.ask_points(start) == OUTSIDE] = 0.0
         all_at = np.vstack([refused_at[:, refused], at])
@@ -144,7 +144,7 @@ def _exits_by_votes(
     return refused_at[-1], refused_by[-1]
 
 
-def _way_out(
+def way_out(
     table: SilhouetteTable,
     base: Float[np.ndarray, "3 n"],
     way: Float[np.ndarray, "3 n"],

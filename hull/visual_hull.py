@@ -23,6 +23,8 @@ from hull.faults import CameraFault, Carved, settle
 from hull.marching import binary_surface
 from hull.rays import RayScene
 from hull.ridges import raise_ridges
+from hull.soft import carve_soft, cross_softly
+from hull.soft_tables import SoftTable, prepare_soft_tables, sure_mask
 from hull.surface import cross_exactly
 from hull.tables import SilhouetteTable, prepare_tables
 from hull.vertex_facts import vertex_facts
@@ -40,10 +42,13 @@ class HullOptions:
     votes : so many cameras must see background before a place is given up. More than one makes the hull
         indifferent to single wrong silhouettes, and larger: by half a millimetre a vote with 68 cameras, by
         three with 16.
+    soft : silhouettes are probabilities, 0 to 255 (128 is one half, not unknown); doubts are summed over the
+        cameras before anything is cut.
     find_faults : cameras whose silhouette contradicts the others are named and kept from cutting the hull.
     """
 
     votes: int = 1
+    soft: bool = False
     find_faults: bool = True
 
 
@@ -117,7 +122,8 @@ def build_hull(
     """The visual hull of one frame.
 
     rig : C pinhole cameras, metres (distortion is not looked at: silhouettes are undistorted).
-    images : per camera (h w) uint8 (255 person, 0 background, 128 unknown) or None (no evidence).
+    images : per camera (h w) uint8 (255 person, 0 background, 128 unknown) or None (no evidence); with
+        `options.soft` probabilities.
     voxel_m : grid pitch. The surface is about four times as accurate; thinner parts than this may be lost.
     bounds : where to look; found from the silhouettes if None.
     options : everything else that is a choice.
@@ -133,9 +139,19 @@ def build_hull(
         raise HullError(
             f"votes is {options.votes}; choose 1 or a few more, 2 fewer than there are silhouettes at most"
         )
+    if options.soft and options.votes > 1:
+        raise HullError("votes and soft silhouettes exclude each other; with soft ones doubts are summed")
+
+    soft = (
+        {table.camera_idx: table for table in prepare_soft_tables(cameras, images)} if options.soft else None
+    )
+    if soft is not None:
+        # Who contradicts whom is asked of what is nearly certain.
+        images = [None if image is None else sure_mask(image) for image in images]
 
     def carve_with(tables: Sequence[SilhouetteTable], rule: WitnessRule, box: Bounds) -> Carved:
-        return _surface(tables, rule, box, voxel_m, options.votes)
+        chosen = None if soft is None else [soft[table.camera_idx] for table in tables]
+        return _surface(tables, chosen, rule, box, voxel_m, options.votes)
 
     faults: tuple[CameraFault, ...] = ()
     if options.find_faults:
@@ -159,16 +175,25 @@ def build_hull(
 
 
 def _surface(
-    tables: Sequence[SilhouetteTable], rule: WitnessRule, bounds: Bounds, voxel_m: float, votes: int
+    tables: Sequence[SilhouetteTable],
+    soft: Sequence[SoftTable] | None,
+    rule: WitnessRule,
+    bounds: Bounds,
+    voxel_m: float,
+    votes: int,
 ) -> Carved:
-    """The closed surface of these tables' hull. Raises HullError where it is empty."""
+    """The closed surface of these tables' hull, or of their soft ones. Raises EmptyHullError."""
     grid = grid_over(bounds, voxel_m)
-    blocks = carve(tables, rule, grid, votes)
+    blocks = carve(tables, rule, grid, votes) if soft is None else carve_soft(soft, rule, grid)
     if not blocks.n_voxels:
         raise EmptyHullError(why_empty(tables, rule, bounds.low, bounds.high))
     surface = binary_surface(blocks)
+    tables = tables if soft is None else soft
     culling = Culling(tables, grid)
-    crossings = cross_exactly(surface, grid, tables, culling, votes)
+    if soft is None:
+        crossings = cross_exactly(surface, grid, tables, culling, votes)
+    else:
+        crossings = cross_softly(surface, grid, soft, culling)
     crossings, faces = raise_ridges(
         crossings,
         surface.faces,
