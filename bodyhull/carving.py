@@ -7,6 +7,7 @@ import sys
 import time
 from collections import Counter
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -26,7 +27,8 @@ from hull.faults import CameraFault
 from hull.hull_file import facts_file, load_hull, save_hull
 from hull.mesh_file import MeshFileError
 from hull.quality import silhouette_agreement
-from hull.visual_hull import build_hull
+from hull.soft_tables import as_mask
+from hull.visual_hull import HullOptions, build_hull
 
 OFTEN_SHARE = 1 / 3
 AGAIN = "run with --overwrite to redo it, or choose another --out"
@@ -143,6 +145,12 @@ def carve_stage(config: RunConfig) -> Recording:
         raise UserError(
             f"--voxel-mm {config.voxel_mm:g}: choose a grid spacing between 0.5 and 100 mm; 8 is usual"
         )
+    if config.votes < 1 or (config.soft and config.votes > 1):
+        raise UserError(
+            f"--votes {config.votes}{' --soft' * config.soft}: give 1 or more votes; "
+            "soft silhouettes are summed and need none"
+        )
+    options = config.hull_options()
     recording = open_for(config)
     folder = RunFolder(config.out)
     state = claim(folder, config, recording.fingerprint())
@@ -165,9 +173,11 @@ def carve_stage(config: RunConfig) -> Recording:
     started = time.perf_counter()
     todo = [k for k in recording.frame_ids if not _carved(folder, k, known)]
     near: Bounds | None = None
-    with silhouettes_ahead(recording.silhouettes, todo) as ahead:
+    with silhouettes_ahead(partial(recording.silhouettes, soft=options.soft), todo) as ahead:
         for silhouettes in tqdm(ahead, total=len(todo), desc="carve", unit="frame", disable=not todo):
-            carved, near = carve_frame(recording, folder, silhouettes, config.voxel_mm, near, config.colours)
+            carved, near = carve_frame(
+                recording, folder, silhouettes, config.voxel_mm, near, options, config.colours
+            )
             frames[f"{carved.frame_id:06d}"] = carved.as_dict()
             folder.update_stage("hull", frames=frames)
     if todo:
@@ -214,6 +224,7 @@ def carve_frame(
     silhouettes: Silhouettes,
     voxel_mm: float,
     near: Bounds | None,
+    options: HullOptions,
     colours: bool = True,
 ) -> tuple[CarvedFrame, Bounds | None]:
     """Carve one frame and write its hull; a frame that cannot be carved comes back marked.
@@ -224,7 +235,9 @@ def carve_frame(
     for problem in silhouettes.problems:
         tqdm.write(f"warning: {problem}", file=sys.stderr)
     try:
-        hull = build_hull(recording.rig, silhouettes.images, voxel_m=voxel_mm / 1e3, near=near)
+        hull = build_hull(
+            recording.rig, silhouettes.images, voxel_m=voxel_mm / 1e3, options=options, near=near
+        )
     except HullError as error:
         message = f"frame {frame_id:06d}: {error}"
         tqdm.write(f"warning: {message}", file=sys.stderr)
@@ -233,7 +246,10 @@ def carve_frame(
         return CarvedFrame(frame_id, "failed", (*silhouettes.problems, message)), None
     for fault in hull.faults:
         tqdm.write(f"warning: frame {frame_id:06d}: {fault.sentence()}", file=sys.stderr)
-    agreement = silhouette_agreement(hull.vertices, hull.faces, recording.rig, silhouettes.images)
+    masks = silhouettes.images
+    if options.soft:
+        masks = tuple(None if image is None else as_mask(image) for image in masks)
+    agreement = silhouette_agreement(hull.vertices, hull.faces, recording.rig, masks)
     if colours:
         rgb = vertex_colours(
             hull.vertices,

@@ -6,11 +6,14 @@ import json
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from bodyhull.errors import UserError
+
+if TYPE_CHECKING:
+    from hull.visual_hull import HullOptions
 
 Units = Literal["auto", "m", "cm", "mm"]
 Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
@@ -51,11 +54,25 @@ class RunConfig:
     """Pose prior to use instead of the built-in one: an .npz with mean (69) and covariance (69 x 69), rad."""
     colours: bool = True
     """Colour the hulls from the pictures, where the recording has any."""
+    votes: int = 1
+    """How many cameras must see background before a place is given up. 2 or 3 are for many cameras and bad
+    masks."""
+    soft: bool = False
+    """Silhouettes hold probabilities (0 to 255) that are weighed against each other, instead of masks."""
+    find_faults: bool = True
+    """Look for cameras whose silhouette contradicts the others, and keep them from cutting the hull."""
 
     def carve_settings(self) -> dict[str, object]:
         """What the hulls depend on, besides the files' contents."""
         values = self.as_dict()
-        return {k: values[k] for k in ("sequence", "frames", "voxel_mm", "units", "up")}
+        names = ("sequence", "frames", "voxel_mm", "units", "up", "votes", "soft", "find_faults")
+        return {k: values[k] for k in names}
+
+    def hull_options(self) -> HullOptions:
+        """The same for `build_hull`."""
+        from hull.visual_hull import HullOptions
+
+        return HullOptions(votes=self.votes, soft=self.soft, find_faults=self.find_faults)
 
     def fit_settings(self) -> dict[str, object]:
         """What the fit depends on, besides the hulls."""

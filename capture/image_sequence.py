@@ -20,7 +20,13 @@ from jaxtyping import UInt8
 
 from capture.errors import RecordingError
 from capture.rig import Rig
-from capture.silhouette_files import png_damage, png_size, read_silhouette, undistort_silhouette
+from capture.silhouette_files import (
+    png_damage,
+    png_size,
+    read_silhouette,
+    undistort_probabilities,
+    undistort_silhouette,
+)
 from capture.silhouettes import Silhouettes, sentence
 
 SILHOUETTES = "SilhouettesPictures"
@@ -122,7 +128,7 @@ class ImageSequence:
     def frame_ids(self) -> tuple[int, ...]:
         return tuple(sorted({frame for files in self.folders.silhouettes.values() for frame in files}))
 
-    def silhouettes(self, frame_id: int) -> Silhouettes:
+    def silhouettes(self, frame_id: int, soft: bool = False) -> Silhouettes:
         images: list[UInt8[np.ndarray, "h w"] | None] = []
         problems: list[str] = []
         for camera in self.calibration:
@@ -130,16 +136,17 @@ class ImageSequence:
             mask, problem = None, "frame missing in this camera"
             path = files.get(frame_id, next(iter(files.values())).parent)
             if frame_id in files:
-                mask, problem = self._read(camera.name, camera.size, path)
-            images.append(None if mask is None else undistort_silhouette(camera, mask))
+                mask, problem = self._read(camera.name, camera.size, path, soft)
+            undistort = undistort_probabilities if soft else undistort_silhouette
+            images.append(None if mask is None else undistort(camera, mask))
             if problem:
                 problems.append(sentence(camera.name, frame_id, problem, path))
         return Silhouettes(frame_id, tuple(images), tuple(problems))
 
     def _read(
-        self, name: str, size: tuple[int, int], path: Path
+        self, name: str, size: tuple[int, int], path: Path, soft: bool
     ) -> tuple[UInt8[np.ndarray, "h w"] | None, str]:
-        found = read_silhouette(path, inverted=name in self.inverted)
+        found = read_silhouette(path, inverted=name in self.inverted, soft=soft)
         if found.mask is None:
             return None, found.problem or "unreadable"
         height, width = found.mask.shape

@@ -56,11 +56,11 @@ class Recording:
     source: FrameSource
     settled: tuple[str, ...] = ()
 
-    def silhouettes(self, frame_id: int) -> Silhouettes:
+    def silhouettes(self, frame_id: int, soft: bool = False) -> Silhouettes:
         """The frame's silhouettes, undistorted, one a camera of `rig`; what could not be had is None and
-        told."""
+        told. `soft`: probabilities of the person, 0 to 255, instead of masks."""
         self._check(frame_id)
-        return self.source.silhouettes(frame_id)
+        return self.source.silhouettes(frame_id, soft)
 
     def picture(self, camera_idx: int, frame_id: int) -> UInt8[np.ndarray, "h w 3"] | None:
         """The frame's picture (h w 3) RGB, undistorted, as camera `rig[camera_idx]` sees it; None where

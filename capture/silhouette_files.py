@@ -19,7 +19,8 @@ from capture.camera import Camera
 
 PERSON, BACKGROUND, UNKNOWN = 255, 0, 128
 # Person and background swapped, unknown kept.
-_SWAPPED = np.arange(255, -1, -1, dtype=np.uint8)
+_SWAPPED_GREY = np.arange(255, -1, -1, dtype=np.uint8)
+_SWAPPED = _SWAPPED_GREY.copy()
 _SWAPPED[UNKNOWN] = UNKNOWN
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
@@ -28,8 +29,9 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 class SilhouetteFile:
     """One file, read. `mask` (h w) is None where the file gives no evidence; `problem` then says why.
 
-    A mask that was usable but odd comes with a problem too. `looks_inverted`: the frame's border and most of
-    the picture are person, as in files where black means person.
+    `mask` holds probabilities, 0 to 255, where those were asked for. A mask that was usable but odd comes
+    with a problem too. `looks_inverted`: the frame's border and most of the picture are person, as in files
+    where black means person.
     """
 
     mask: UInt8[np.ndarray, "h w"] | None
@@ -37,9 +39,9 @@ class SilhouetteFile:
     looks_inverted: bool = False
 
 
-def read_silhouette(path: Path, *, inverted: bool = False) -> SilhouetteFile:
-    """Read one silhouette; `inverted` swaps person and background. Problems are phrases without camera and
-    frame."""
+def read_silhouette(path: Path, *, inverted: bool = False, soft: bool = False) -> SilhouetteFile:
+    """Read one silhouette; `inverted` swaps person and background, `soft` keeps its grey values as
+    probabilities. Problems are phrases without camera and frame."""
     try:
         content = path.read_bytes()
     except FileNotFoundError:
@@ -54,12 +56,12 @@ def read_silhouette(path: Path, *, inverted: bool = False) -> SilhouetteFile:
     image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content else None
     if image is None:
         return SilhouetteFile(None, "not an image that OpenCV can decode")
-    mask, problem = mask_from_image(image)
+    mask, problem = (probabilities_from_image(image), None) if soft else mask_from_image(image)
     if mask is None:
         return SilhouetteFile(None, problem)
     if inverted:
-        mask = cv2.LUT(mask, _SWAPPED).reshape(mask.shape)
-    share = _n_equal(mask, PERSON) / mask.size
+        mask = cv2.LUT(mask, _SWAPPED_GREY if soft else _SWAPPED).reshape(mask.shape)
+    share = (int(np.count_nonzero(mask > 127)) if soft else _n_equal(mask, PERSON)) / mask.size
     if share == 0:
         return SilhouetteFile(None, "silhouette is empty (no pixel is person)")
     if share > 0.999:
@@ -108,19 +110,7 @@ def mask_from_image(
     image: Shaped[np.ndarray, "h w *channels"],
 ) -> tuple[UInt8[np.ndarray, "h w"] | None, str | None]:
     """Decoded image -> (mask of 0, 128, 255; problem). The mask is None for what is a photograph, no mask."""
-    grey = _single_channel(image)
-    if grey.dtype == np.bool_:
-        grey = grey.astype(np.uint8) * 255
-    if np.issubdtype(grey.dtype, np.integer) and grey.dtype != np.uint8:
-        top = int(grey.max(initial=0))
-        # 16-bit files hold either the full range or small label numbers.
-        grey = (grey // 257 if top > 255 else grey).astype(np.uint8)
-    elif np.issubdtype(grey.dtype, np.floating):
-        grey = np.clip(np.nan_to_num(grey) * (255 if grey.max(initial=0) <= 1 else 1), 0, 255).astype(
-            np.uint8
-        )
-    # OpenCV counts a picture of four megapixels in a tenth of numpy's time; it wants pixels side by side.
-    grey = np.ascontiguousarray(grey)
+    grey = _bytes(image)
     n_any, label = cv2.countNonZero(grey), int(grey.max(initial=0))
     if 0 < n_any < grey.size and label != UNKNOWN and _n_equal(grey, label) == n_any:
         # Nothing and one label: person, whichever number the label has.
@@ -140,6 +130,23 @@ def mask_from_image(
     return mask, None
 
 
+def probabilities_from_image(image: Shaped[np.ndarray, "h w *channels"]) -> UInt8[np.ndarray, "h w"]:
+    """Decoded image -> how surely each pixel shows the person, 0 to 255. A single label means 255."""
+    grey = _bytes(image)
+    label = int(grey.max(initial=0))
+    if 0 < label < PERSON and _n_equal(grey, label) == cv2.countNonZero(grey):
+        return cv2.threshold(grey, 0, PERSON, cv2.THRESH_BINARY)[1].astype(np.uint8, copy=False)
+    return grey
+
+
+def undistort_probabilities(camera: Camera, grey: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    """As `camera.pinhole()` sees them: bilinear; what the camera never saw is one half."""
+    if camera.is_pinhole:
+        return grey
+    seen = camera.undistort_image(np.full(grey.shape, 255, dtype=np.uint8))
+    return np.where(seen > 127, camera.undistort_image(grey), np.uint8(UNKNOWN)).astype(np.uint8)
+
+
 def undistort_silhouette(camera: Camera, mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     """The mask as `camera.pinhole()` sees it: bilinear, cut at half; what the camera never saw is unknown.
 
@@ -153,6 +160,23 @@ def undistort_silhouette(camera: Camera, mask: UInt8[np.ndarray, "h w"]) -> UInt
     result = np.where(person > 127, PERSON, BACKGROUND).astype(np.uint8)
     result[(known <= 127) & (person <= 127)] = UNKNOWN
     return result
+
+
+def _bytes(image: Shaped[np.ndarray, "h w *channels"]) -> UInt8[np.ndarray, "h w"]:
+    """One channel of 0 to 255, whatever the depth; small label numbers stay as they are."""
+    grey = _single_channel(image)
+    if grey.dtype == np.bool_:
+        grey = grey.astype(np.uint8) * 255
+    if np.issubdtype(grey.dtype, np.integer) and grey.dtype != np.uint8:
+        top = int(grey.max(initial=0))
+        # 16-bit files hold either the full range or small label numbers.
+        grey = (grey // 257 if top > 255 else grey).astype(np.uint8)
+    elif np.issubdtype(grey.dtype, np.floating):
+        grey = np.clip(np.nan_to_num(grey) * (255 if grey.max(initial=0) <= 1 else 1), 0, 255).astype(
+            np.uint8
+        )
+    # OpenCV counts a picture of four megapixels in a tenth of numpy's time; it wants pixels side by side.
+    return np.ascontiguousarray(grey)
 
 
 def _single_channel(image: Shaped[np.ndarray, "h w *channels"]) -> Shaped[np.ndarray, "h w"]:
@@ -169,7 +193,7 @@ def _single_channel(image: Shaped[np.ndarray, "h w *channels"]) -> Shaped[np.nda
 
 def _border_share(mask: UInt8[np.ndarray, "h w"]) -> float:
     border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
-    return float((border == PERSON).mean())
+    return float((border > UNKNOWN).mean())
 
 
 def _n_equal(image: UInt8[np.ndarray, "h w"], value: int) -> int:

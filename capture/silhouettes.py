@@ -14,8 +14,8 @@ from jaxtyping import UInt8
 class Silhouettes:
     """One frame's silhouettes as the pinhole rig sees them.
 
-    images : one a camera, (h w) uint8: 255 person, 0 background, 128 unknown; None: no evidence from this
-    camera.
+    images : one a camera, (h w) uint8: 255 person, 0 background, 128 unknown, or probabilities of the person,
+    0 to 255, where they were asked for; None: no evidence from this camera.
     problems : a sentence each, naming camera, frame and file.
     """
 
@@ -33,8 +33,8 @@ class FrameSource(Protocol):
     def frame_ids(self) -> tuple[int, ...]:
         """Every frame that at least one camera has, ascending."""
 
-    def silhouettes(self, frame_id: int) -> Silhouettes:
-        """The frame's silhouettes, undistorted. Never raises for a bad file."""
+    def silhouettes(self, frame_id: int, soft: bool = False) -> Silhouettes:
+        """The frame's silhouettes, undistorted; `soft`: as probabilities. Never raises for a bad file."""
 
     def picture(self, camera_idx: int, frame_id: int) -> UInt8[np.ndarray, "h w 3"] | None:
         """The frame's picture as filmed (lens distortion included), RGB; None where there is none."""

@@ -113,7 +113,8 @@ class VideoSequence:
     def frame_ids(self) -> tuple[int, ...]:
         return tuple(range(max(video.n_frames for video in self._videos.values())))
 
-    def silhouettes(self, frame_id: int) -> Silhouettes:
+    def silhouettes(self, frame_id: int, soft: bool = False) -> Silhouettes:
+        # What is unknown in a mask is one half as a probability: the same number.
         if frame_id not in self._masks:
             self._masks[frame_id] = self._segmented(frame_id)
         packed, problems = self._masks[frame_id]

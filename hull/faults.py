@@ -117,12 +117,15 @@ def settle(
     carve_with: CarveWith,
     votes: int = 1,
     near: Bounds | None = None,
+    mend: bool = True,
 ) -> Settled:
     """Carve, look for contradictions, carve again without the cameras at fault, until the rest agrees.
 
-    `votes`: so many cameras must refuse a place to cut it. `carve_with` makes the surface of some tables and
-    raises EmptyHullError where nothing is left; that is raised where nothing is left whatever few cameras are
-    left out. `near`: as for `bounds_from_tables`.
+    `votes`: so many cameras must refuse a place to cut it. `mend`: silhouettes may get unknown regions, which
+    `carve_with` must heed; else a camera at fault is left out altogether. `near`: as for
+    `bounds_from_tables`.
+    `carve_with` makes the surface of some tables and raises EmptyHullError where nothing is left; that is
+    raised where nothing is left whatever few cameras are left out.
     """
     cameras = _Cameras(
         tuple(rig), list(images), {table.camera_idx: table for table in prepare_tables(rig, images)}
@@ -162,7 +165,7 @@ def settle(
         if carved is None:
             assert error is not None
             raise error
-        if cameras.unjudged and _judge(cameras, carved.scene):
+        if cameras.unjudged and _judge(cameras, carved.scene, mend):
             continue
         return _settled(cameras, carved, tables, rule, box, n_lines, missed, fresh)
     raise HullError(
@@ -222,7 +225,7 @@ def _blamed(
     return found
 
 
-def _judge(cameras: _Cameras, scene: RayScene) -> bool:
+def _judge(cameras: _Cameras, scene: RayScene, mend: bool) -> bool:
     """Say what is wrong with each camera left out; True where one comes back with a region unknown."""
     returned = False
     for idx in sorted(cameras.unjudged):
@@ -230,7 +233,7 @@ def _judge(cameras: _Cameras, scene: RayScene) -> bool:
         assert image is not None
         fault, mended = classified(cameras.rig[idx], idx, image, scene)
         cameras.faults[idx] = fault
-        if mended is not None and len(cameras.tables) < MENDED_BELOW:
+        if mend and mended is not None and len(cameras.tables) < MENDED_BELOW:
             cameras.faults[idx] = fault.done(FaultAction.REGION_UNKNOWN)
             cameras.images[idx] = mended
             cameras.tables[idx] = prepare_table(cameras.rig[idx], mended, idx)

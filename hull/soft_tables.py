@@ -30,7 +30,7 @@ from hull.tables import BLOCK_PX, OUTSIDE, UNKNOWN, SilhouetteTable, prepare_tab
 # is covered by the person anyway.
 _FALSE_ALARM, _MISSED, _COVERED = 0.05, 0.05, 0.5
 # How far a blurred outline is from sure background, px.
-_BLUR_PX = 4
+_BLUR_PX = 2
 # So much doubt may remain: what one camera that is sure of the person weighs. A single camera passes it where
 # its probability is below 0.24.
 LIMIT = float(np.log((1 - _MISSED) / (_COVERED * (1 - _MISSED) + (1 - _COVERED) * _FALSE_ALARM)))

@@ -155,7 +155,7 @@ def build_hull(
 
     faults: tuple[CameraFault, ...] = ()
     if options.find_faults:
-        settled = settle(cameras, images, bounds, carve_with, options.votes, near)
+        settled = settle(cameras, images, bounds, carve_with, options.votes, near, mend=soft is None)
         carved, faults = settled.carved, settled.faults
     else:
         tables = prepare_tables(cameras, images)

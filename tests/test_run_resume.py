@@ -256,7 +256,7 @@ def test_the_configuration_survives_its_file(tmp_path: Path) -> None:
     plain = RunConfig(tmp_path / "a", tmp_path / "b")
     full = RunConfig(
         tmp_path / "a", tmp_path / "b", "walk", "free:male", tmp_path / "c.json", "0:9:3", 5.0, "mm", "-y",
-        tmp_path / "plates", tmp_path / "keypoints", True, tmp_path / "prior.npz",
+        tmp_path / "plates", tmp_path / "keypoints", True, tmp_path / "prior.npz", False, 2, False, False,
     )  # fmt: skip
     for config in (plain, full):
         assert RunConfig.from_dict(json.loads(json.dumps(config.as_dict()))) == config
