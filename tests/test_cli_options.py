@@ -25,8 +25,9 @@ COMMANDS = {
     "body info": "FILE",
     "body convert": "FILE OUT.npz --overwrite",
     "body show": "FILE --out --sheet",
-    "rig-study": "--out --layout --calibration --size --units --up --cameras --widths --calibration-px --mask-px "
-    "--base-cameras --base-width --frames --motion --garment --seed --body --hull-only --jobs --overwrite",
+    "rig-study": "--out --layout --calibration --size --units --up --cameras --widths --calibration-px "
+    "--mask-px --base-cameras --base-width --frames --motion --garment --seed --body --hull-only "
+    "--jobs --overwrite",
     "doctor": "",
     "demo": "--out --seed --motion --garment",
 }
