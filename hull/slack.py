@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from hull.culling import Culling
 from hull.rays import RayScene
@@ -26,8 +26,6 @@ _NUDGE_PX = 0.5
 # Slack is measured at no more vertices than this and spread to their neighbours: it changes slowly, and finer
 # grids should not cost more rays.
 MAX_MEASURED = 24_000
-# The code of four pixels that all show the person; larger ones hold unknown pixels (hull.tables).
-_ALL_PERSON = 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +53,10 @@ def outlines_at(points: Float[np.ndarray, "n 3"], culling: Culling) -> Outlines:
     point_idx, table_idx = [], []
     for k, table in enumerate(culling.tables):
         seen, unsure = culling.evidence(k, blocks)
-        seen[unsure] = table.ask_points(columns[:, unsure]) != NO_EVIDENCE
+        seen[unsure] = table.ask_points(columns.take(unsure, axis=1)) != NO_EVIDENCE
         n_witnesses += seen
         near = culling.may_be_outlined(k, blocks)
-        on_it = near[_on_outline(table, columns[:, near])]
+        on_it = near.take(table.on_outline(columns.take(near, axis=1)))
         point_idx.append(on_it)
         table_idx.append(np.full(len(on_it), k))
     found = np.concatenate(point_idx)
@@ -116,21 +114,6 @@ def spread_to_neighbours(
             break
         values[reached] = sums[reached] / weights[reached]
     return np.nan_to_num(values, nan=0.0)
-
-
-def _on_outline(table: SilhouetteTable, points: Float[np.ndarray, "3 n"]) -> Bool[np.ndarray, " n"]:
-    """Whether person and background meet among the four pixels around each point (3 N)."""
-    u, v, depth = table.projection[:, :3] @ points + table.projection[:, 3:]
-    in_front = depth > 0.0
-    safe_depth = np.where(in_front, depth, 1.0)
-    column, row = np.floor(u / safe_depth), np.floor(v / safe_depth)
-    seen = in_front & (column >= table.lowest[0]) & (column <= table.highest[0])
-    seen &= (row >= table.lowest[1]) & (row <= table.highest[1])
-    height, width = table.codes.shape
-    x = np.clip(np.where(seen, column, 0.0).astype(np.int64) - table.origin[0], 0, width - 1)
-    y = np.clip(np.where(seen, row, 0.0).astype(np.int64) - table.origin[1], 0, height - 1)
-    codes = table.codes.ravel().take(y * width + x)
-    return seen & (codes > 0) & (codes < _ALL_PERSON)
 
 
 def _focal_px(table: SilhouetteTable) -> float:

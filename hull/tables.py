@@ -79,6 +79,11 @@ class SilhouetteTable:
         answers[outline] = np.where(value >= 0.5, np.uint8(INSIDE), np.uint8(OUTSIDE))
         return answers
 
+    def on_outline(self, points: Float[np.ndarray, "3 n"]) -> Int[np.ndarray, " m"]:
+        """Which (M,) of the points person and background meet at, among the four pixels around."""
+        _, outline, _ = self._looked_up(*self._pixels(points))
+        return outline
+
     def ask_along(
         self,
         base: Float[np.ndarray, "3 n"],
