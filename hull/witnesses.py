@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt64
@@ -42,6 +43,11 @@ class WitnessRule:
         """The set of all cameras, one row of words."""
         return packed(np.ones(self.n_cameras, dtype=bool))
 
+    @cached_property
+    def _far_sets(self) -> tuple[UInt64[np.ndarray, " w"], ...]:
+        """For each camera the set of those that look from a direction different enough."""
+        return tuple(packed(row) for row in self.angles_rad >= self.spread_rad)
+
     def enough(self, sets: UInt64[np.ndarray, "w n"]) -> Bool[np.ndarray, " n"]:
         """For each column of `sets` (W N): is it enough?"""
         count = np.bitwise_count(sets).sum(axis=0, dtype=np.int64)
@@ -54,7 +60,7 @@ class WitnessRule:
                 break
             word, bit = camera // WORD_BITS, np.uint64(1) << np.uint64(camera % WORD_BITS)
             has_it = (sets[word, open_] & bit) != 0
-            has_far = (sets[:, open_] & packed(far[camera])[:, None]).any(axis=0)
+            has_far = (sets[:, open_] & self._far_sets[camera][:, None]).any(axis=0)
             verdict[open_[has_it & has_far]] = True
             open_ = open_[~(has_it & has_far)]
         return verdict
