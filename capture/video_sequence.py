@@ -10,6 +10,7 @@ first one.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from pathlib import Path
 
 import cv2
@@ -28,6 +29,8 @@ from capture.video_file import VideoFile
 VIDEOS = "videos"
 BACKGROUND = "background"
 _VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".m4v")
+# A thousand frames of 16 cameras; a longer recording is segmented again where later stages ask for it.
+_MOST_MASKS_BYTES = 256_000_000
 _PLATE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _N_SAMPLES = 20
 _SHORTEST_SPAN = 100  # frames that the samples cover at least, where the videos have them
@@ -107,7 +110,8 @@ class VideoSequence:
         self._plates = plates
         self._chosen = chosen
         self._backgrounds: Backgrounds | None = None
-        self._masks: dict[int, tuple[list[bytes | None], tuple[str, ...]]] = {}
+        self._masks: OrderedDict[int, tuple[list[bytes | None], tuple[str, ...]]] = OrderedDict()
+        self._masks_bytes = 0
 
     @property
     def frame_ids(self) -> tuple[int, ...]:
@@ -116,7 +120,7 @@ class VideoSequence:
     def silhouettes(self, frame_id: int, soft: bool = False) -> Silhouettes:
         # What is unknown in a mask is one half as a probability: the same number.
         if frame_id not in self._masks:
-            self._masks[frame_id] = self._segmented(frame_id)
+            self._keep(frame_id, *self._segmented(frame_id))
         packed, problems = self._masks[frame_id]
         images = tuple(None if mask is None else _mask_from_png(mask) for mask in packed)
         return Silhouettes(frame_id, images, problems)
@@ -127,6 +131,14 @@ class VideoSequence:
     def files(self, frame_ids: tuple[int, ...]) -> list[Path]:
         names = self.calibration.names
         return [self._videos[name].path for name in names] + [self._plates[name] for name in names]
+
+    def _keep(self, frame_id: int, packed: list[bytes | None], problems: tuple[str, ...]) -> None:
+        """Remember a frame's masks; the oldest ones are forgotten when all take too much room."""
+        self._masks[frame_id] = packed, problems
+        self._masks_bytes += _n_bytes(packed)
+        while self._masks_bytes > _MOST_MASKS_BYTES and len(self._masks) > 1:
+            _, (forgotten, _) = self._masks.popitem(last=False)
+            self._masks_bytes -= _n_bytes(forgotten)
 
     def _segmented(self, frame_id: int) -> tuple[list[bytes | None], tuple[str, ...]]:
         """The frame's masks as PNG bytes (a few kB each: they are asked for again by later stages), and
@@ -193,6 +205,10 @@ def length_notes(videos: dict[str, VideoFile]) -> list[str]:
         return []
     listing = ", ".join(f"{camera} {n_frames}" for camera, n_frames in lengths.items())
     return [f"The videos differ in length ({listing} frames): check that they start at the same moment."]
+
+
+def _n_bytes(packed: list[bytes | None]) -> int:
+    return sum(len(mask) for mask in packed if mask is not None)
 
 
 def _png(mask: UInt8[np.ndarray, "h w"]) -> bytes:

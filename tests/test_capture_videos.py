@@ -3,6 +3,7 @@ refusals."""
 
 import pickle
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -54,6 +55,21 @@ def test_the_subject_is_segmented_before_a_wrong_plate(filmed):
     )
 
 
+def test_forgotten_masks_are_made_again(filmed, monkeypatch):
+    """A long recording remembers so many bytes of masks and no more."""
+    root, _ = filmed
+    recording = open_recording(root, frames="0:8:2")
+    first = recording.silhouettes(0)
+    limit = 3 * recording.source._masks_bytes // 2
+    monkeypatch.setattr("capture.video_sequence._MOST_MASKS_BYTES", limit)
+    for frame_id in (2, 4, 6):
+        recording.silhouettes(frame_id)
+        assert recording.source._masks_bytes <= limit
+    assert list(recording.source._masks) == [6]
+    again = recording.silhouettes(0)
+    assert all(np.array_equal(a, b) for a, b in zip(first.images, again.images, strict=True))
+
+
 def test_frames_are_found_by_number_in_any_order(filmed):
     root, truth = filmed
     video = VideoFile(root / "videos" / "cam01.mp4")
@@ -63,6 +79,12 @@ def test_frames_are_found_by_number_in_any_order(filmed):
         assert np.array_equal(video.read(idx), sequential[idx])
     assert video.read(24) is None and video.read(500) is None
     assert np.array_equal(video.read(5), sequential[5]), "still usable after its end"
+    # Two threads at once, one ahead of the other, as when silhouettes are read while pictures are looked up.
+    with ThreadPoolExecutor(2) as pool:
+        ahead = pool.map(video.read, range(1, 24))
+        behind = pool.map(video.read, range(23))
+        assert all(np.array_equal(a, b) for a, b in zip(ahead, sequential[1:], strict=True))
+        assert all(np.array_equal(a, b) for a, b in zip(behind, sequential[:-1], strict=True))
     # Red and blue are not swapped: skin is red.
     skin = sequential[0][truth[1, 0] > 0].mean(axis=0)
     assert skin[0] > skin[2] + 20
