@@ -46,8 +46,8 @@ NOTED_PACKAGES = (
 
 @dataclass(frozen=True)
 class CarvedFrame:
-    """What is known of a frame's hull: status "ok", "degraded" (a camera gave no evidence, or contradicts the
-    others) or "failed"."""
+    """What is known of a frame's hull: status "ok", "degraded" (a camera gave no evidence or contradicts the
+    others, there is a second subject, or one that leaves what the cameras see) or "failed"."""
 
     frame_id: int
     status: str
@@ -244,8 +244,8 @@ def carve_frame(
         folder.hull(frame_id).unlink(missing_ok=True)
         facts_file(folder.hull(frame_id)).unlink(missing_ok=True)
         return CarvedFrame(frame_id, "failed", (*silhouettes.problems, message)), None
-    for fault in hull.faults:
-        tqdm.write(f"warning: frame {frame_id:06d}: {fault.sentence()}", file=sys.stderr)
+    for sentence in (*hull.marks, *(fault.sentence() for fault in hull.faults)):
+        tqdm.write(f"warning: frame {frame_id:06d}: {sentence}", file=sys.stderr)
     masks = silhouettes.images
     if options.soft:
         masks = tuple(None if image is None else as_mask(image) for image in masks)
@@ -265,7 +265,7 @@ def carve_frame(
     problems = (*silhouettes.problems, *hull.problems)
     carved = CarvedFrame(
         frame_id,
-        "degraded" if silhouettes.problems or hull.faults else "ok",
+        "degraded" if silhouettes.problems or hull.faults or hull.marks else "ok",
         problems,
         tuple(None if np.isnan(v) else round(float(v), 5) for v in agreement),
         round(hull.volume_m3, 6),

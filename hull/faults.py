@@ -51,7 +51,7 @@ class Carved:
     ------
     vertices (V 3), faces (F 3) : closed, world metres.
     cut_by : (V,) the table on whose cone a vertex lies, or -1.
-    problems : a sentence each.
+    problems, marks : a sentence each; see `Hull`.
     culling : of the tables it was carved with.
     scene : the surface, ready for rays.
     """
@@ -60,6 +60,7 @@ class Carved:
     faces: Int[np.ndarray, "f 3"]
     cut_by: Int[np.ndarray, " v"]
     problems: tuple[str, ...]
+    marks: tuple[str, ...]
     culling: Culling
     scene: RayScene
 
@@ -144,8 +145,7 @@ def settle(
         blamed = _blamed(tables, n_lines, missed)
         if not blamed and missed.scale * len(missed.table) > _MOSTLY_MISSED * n_lines.sum():
             # Faults that agree with each other may have put the box anywhere.
-            n_lines, missed = missed_lines(tables, rule, _around(tables), scene, votes)
-            blamed = _blamed(tables, n_lines, missed)
+            blamed = _blamed(tables, *missed_lines(tables, rule, _around(tables), scene, votes))
         if carved is not None and votes == 1:
             blamed += [k for k in false_holes(tables, box) if k not in blamed]
         room = cameras.room()

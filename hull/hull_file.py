@@ -49,6 +49,7 @@ def save_hull(path: Path | str, hull: Hull) -> None:
                 stream,
                 checksum=np.int64(_checksum(hull.vertices)),
                 problems=np.array(json.dumps(list(hull.problems))),
+                marks=np.array(json.dumps(list(hull.marks))),
                 faults=np.array(json.dumps([asdict(fault) for fault in hull.faults])),
                 **{name: getattr(hull, name).astype(kind) for name, kind in _KINDS.items()},
             )
@@ -72,6 +73,7 @@ def load_hull(path: Path | str) -> Hull:
         with beside.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             found = {name: archive[name] for name in archive.files}
         problems = tuple(json.loads(str(found["problems"])))
+        marks = tuple(json.loads(str(found["marks"])))
         faults = tuple(_fault(values) for values in json.loads(str(found["faults"])))
         checksum = int(found["checksum"])
         facts = {name: found[name] for name in _KINDS}
@@ -93,6 +95,7 @@ def load_hull(path: Path | str) -> Hull:
         colours=load_colours(path),
         problems=problems,
         faults=faults,
+        marks=marks,
     )
 
 

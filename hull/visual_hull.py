@@ -21,6 +21,7 @@ from hull.diagnosis import why_empty
 from hull.errors import EmptyHullError, HullError
 from hull.faults import CameraFault, Carved, settle
 from hull.marching import binary_surface
+from hull.marks import elsewhere_mark, leaving_mark, one_subject
 from hull.rays import RayScene
 from hull.ridges import raise_ridges
 from hull.soft import carve_soft, cross_softly
@@ -72,6 +73,8 @@ class Hull:
     colours : (V 3) RGB from the pictures, or None.
     problems : one sentence each about what had to be left out or decided.
     faults : cameras whose silhouette contradicts the others, and what was done about each.
+    marks : those of the problems that make the hull itself doubtful: a second subject, or one that leaves
+        what the cameras see.
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -85,6 +88,7 @@ class Hull:
     colours: UInt8[np.ndarray, "v 3"] | None = None
     problems: tuple[str, ...] = ()
     faults: tuple[CameraFault, ...] = ()
+    marks: tuple[str, ...] = ()
 
     @staticmethod
     def of_mesh(
@@ -154,14 +158,21 @@ def build_hull(
         return _surface(tables, chosen, rule, box, voxel_m, options.votes)
 
     faults: tuple[CameraFault, ...] = ()
+    marks: tuple[str, ...] = ()
     if options.find_faults:
         settled = settle(cameras, images, bounds, carve_with, options.votes, near, mend=soft is None)
-        carved, faults = settled.carved, settled.faults
+        carved, faults, box = settled.carved, settled.faults, settled.bounds
+        marks = elsewhere_mark(settled.tables, settled.n_lines, settled.missed)
     else:
         tables = prepare_tables(cameras, images)
         box = bounds if bounds is not None else bounds_from_tables(tables, near)
         carved = carve_with(tables, witness_rule(tables, box.centre), box)
     normals = vertex_normals(carved.vertices, carved.faces)
+    marks = (
+        *carved.marks,
+        *marks,
+        *leaving_mark(carved.vertices, normals, carved.cut_by, voxel_m, box, carved.culling.tables),
+    )
     return Hull(
         vertices=carved.vertices,
         faces=carved.faces,
@@ -169,8 +180,9 @@ def build_hull(
         **vars(
             vertex_facts(carved.vertices, carved.faces, normals, carved.cut_by, carved.culling, carved.scene)
         ),
-        problems=(*carved.problems, *(fault.sentence() for fault in faults)),
+        problems=(*carved.problems, *marks, *(fault.sentence() for fault in faults)),
         faults=faults,
+        marks=marks,
     )
 
 
@@ -205,10 +217,15 @@ def _surface(
     )
     kept, faces, problems = keep_what_matters(crossings.vertices, faces, tables)
     vertices, cut_by = crossings.vertices[kept], crossings.cut_by[kept]
+    marks: tuple[str, ...] = ()
+    if problems:
+        # Only where there is more than one piece, that is.
+        kept, faces, marks = one_subject(vertices, faces)
+        vertices, cut_by = vertices[kept], cut_by[kept]
     assert is_closed(faces, len(vertices)), "the hull's surface is not closed"
     # One thread: frames are what runs in parallel.
     scene = RayScene(vertices, faces, n_threads=1)
-    return Carved(vertices, faces, cut_by, problems + _touching(blocks.span(), grid), culling, scene)
+    return Carved(vertices, faces, cut_by, problems + _touching(blocks.span(), grid), marks, culling, scene)
 
 
 def grid_over(bounds: Bounds, voxel_m: float) -> Grid:
