@@ -16,8 +16,8 @@ from hull.cleaning import compacted, face_pieces, piece_volumes
 from hull.evidence import MissedLines
 from hull.tables import NO_EVIDENCE, SilhouetteTable
 
-# A separate piece of this share of the largest is another subject, not a hand.
-SUBJECT_SHARE = 0.3
+# A separate piece of this share of the largest is another subject, not a hand, if it is as long as this.
+SUBJECT_SHARE, SUBJECT_M = 0.3, 0.6
 # Something else is there when this share of a camera's lines of sight, in this share of cameras, needs it.
 _ELSEWHERE_LINES, _ELSEWHERE_CAMERAS = 0.08, 0.5
 # The hull may end so much, square metres, for want of witnesses (a wrist's cross-section).
@@ -36,10 +36,17 @@ def one_subject(
     label = face_pieces(faces, len(vertices))
     volumes = piece_volumes(vertices, faces, label)
     largest = int(np.argmax(volumes))
-    others = [k for k in np.flatnonzero(volumes >= SUBJECT_SHARE * volumes[largest]) if k != largest]
+    pieces = [vertices[np.unique(faces[label == k])] for k in range(len(volumes))]
+    others = [
+        k
+        for k, piece in enumerate(pieces)
+        if k != largest
+        and volumes[k] >= SUBJECT_SHARE * volumes[largest]
+        and np.ptp(piece, axis=0).max() >= SUBJECT_M
+    ]
     if not others:
         return np.ones(len(vertices), dtype=bool), faces, ()
-    middles = np.array([vertices[np.unique(faces[label == k])].mean(axis=0) for k in range(len(volumes))])
+    middles = np.array([piece.mean(axis=0) for piece in pieces])
     to_largest = np.linalg.norm(middles - middles[largest], axis=1)
     to_others = np.min([np.linalg.norm(middles - middles[k], axis=1) for k in others], axis=0)
     keep = to_largest < to_others
@@ -56,9 +63,20 @@ def one_subject(
 
 
 def elsewhere_mark(
-    tables: Sequence[SilhouetteTable], n_lines: Int[np.ndarray, " c"], missed: MissedLines
+    vertices: Float[np.ndarray, "v 3"],
+    voxel_m: float,
+    bounds: Bounds,
+    tables: Sequence[SilhouetteTable],
+    n_lines: Int[np.ndarray, " c"],
+    missed: MissedLines,
 ) -> tuple[str, ...]:
-    """A sentence where many cameras show something outside the box that was carved."""
+    """A sentence where many cameras show something outside the box that was carved.
+
+    Not where the hull itself is cut off by the box: then it is the same subject that goes on there.
+    """
+    margin = 2.0 * voxel_m
+    if (vertices < bounds.low + margin).any() or (vertices > bounds.high - margin).any():
+        return ()
     share = (
         missed.scale
         * np.bincount(missed.table[missed.elsewhere], minlength=len(tables))

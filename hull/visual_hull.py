@@ -162,7 +162,7 @@ def build_hull(
     if options.find_faults:
         settled = settle(cameras, images, bounds, carve_with, options.votes, near, mend=soft is None)
         carved, faults, box = settled.carved, settled.faults, settled.bounds
-        marks = elsewhere_mark(settled.tables, settled.n_lines, settled.missed)
+        marks = elsewhere_mark(carved.vertices, voxel_m, box, settled.tables, settled.n_lines, settled.missed)
     else:
         tables = prepare_tables(cameras, images)
         box = bounds if bounds is not None else bounds_from_tables(tables, near)
