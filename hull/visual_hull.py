@@ -23,6 +23,7 @@ from hull.faults import CameraFault, Carved, settle
 from hull.marching import binary_surface
 from hull.marks import elsewhere_mark, leaving_mark, one_subject
 from hull.rays import RayScene
+from hull.refine import refined
 from hull.ridges import raise_ridges
 from hull.soft import carve_soft, cross_softly
 from hull.soft_tables import SoftTable, prepare_soft_tables, sure_mask
@@ -46,11 +47,14 @@ class HullOptions:
     soft : silhouettes are probabilities, 0 to 255 (128 is one half, not unknown); doubts are summed over the
         cameras before anything is cut.
     find_faults : cameras whose silhouette contradicts the others are named and kept from cutting the hull.
+    refine : move the surface inwards to where it is smooth and all silhouettes still are as they were. Then
+        it is no longer the largest shape that fits, but nearer to the person.
     """
 
     votes: int = 1
     soft: bool = False
     find_faults: bool = True
+    refine: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,19 +171,22 @@ def build_hull(
         tables = prepare_tables(cameras, images)
         box = bounds if bounds is not None else bounds_from_tables(tables, near)
         carved = carve_with(tables, witness_rule(tables, box.centre), box)
-    normals = vertex_normals(carved.vertices, carved.faces)
+    vertices, faces = carved.vertices, carved.faces
+    normals = vertex_normals(vertices, faces)
     marks = (
         *carved.marks,
         *marks,
-        *leaving_mark(carved.vertices, normals, carved.cut_by, voxel_m, box, carved.culling.tables),
+        *leaving_mark(vertices, normals, carved.cut_by, voxel_m, box, carved.culling.tables),
     )
+    facts = vertex_facts(vertices, faces, normals, carved.cut_by, carved.culling, carved.scene)
+    if options.refine:
+        vertices = refined(vertices, faces, normals, facts.slack_m, carved.culling, carved.scene)
+        normals = vertex_normals(vertices, faces)
     return Hull(
-        vertices=carved.vertices,
-        faces=carved.faces,
+        vertices=vertices,
+        faces=faces,
         normals=normals,
-        **vars(
-            vertex_facts(carved.vertices, carved.faces, normals, carved.cut_by, carved.culling, carved.scene)
-        ),
+        **vars(facts),
         problems=(*carved.problems, *marks, *(fault.sentence() for fault in faults)),
         faults=faults,
         marks=marks,
