@@ -61,18 +61,22 @@ class RunConfig:
     """Silhouettes hold probabilities (0 to 255) that are weighed against each other, instead of masks."""
     find_faults: bool = True
     """Look for cameras whose silhouette contradicts the others, and keep them from cutting the hull."""
+    refine: bool = False
+    """Smooth the hulls inwards as far as all silhouettes allow: nearer to the person, in a few seconds a
+    frame.
+    """
 
     def carve_settings(self) -> dict[str, object]:
         """What the hulls depend on, besides the files' contents."""
         values = self.as_dict()
-        names = ("sequence", "frames", "voxel_mm", "units", "up", "votes", "soft", "find_faults")
+        names = ("sequence", "frames", "voxel_mm", "units", "up", "votes", "soft", "find_faults", "refine")
         return {k: values[k] for k in names}
 
     def hull_options(self) -> HullOptions:
         """The same for `build_hull`."""
         from hull.visual_hull import HullOptions
 
-        return HullOptions(votes=self.votes, soft=self.soft, find_faults=self.find_faults)
+        return HullOptions(self.votes, self.soft, self.find_faults, self.refine)
 
     def fit_settings(self) -> dict[str, object]:
         """What the fit depends on, besides the hulls."""

@@ -23,8 +23,10 @@ from hull.tables import INSIDE, SilhouetteTable
 LEAST_SLACK_M = 0.04
 # Smaller patches are not worth a word (square metres): a hand's palm has 80 cm^2.
 LEAST_AREA_M2 = 0.002
-# Rays go this far inside of the surface (metres), or they would hit and miss it by rounding.
-_NUDGE_M = 0.002
+# Rays pass this far inside of the surface (metres): along a flat part they would meet its every unevenness,
+# so what is thick enough is asked again deeper.
+_DEPTHS_M = (0.002, 0.015)
+_LEAST_M = 0.0005
 
 
 def find_phantoms(
@@ -38,15 +40,18 @@ def find_phantoms(
     """(V,) true on connected patches of the surface that no safe ray passes through. `scene`: this mesh."""
     phantom = np.zeros(len(vertices), dtype=bool)
     unsafe = np.flatnonzero(slack_m > LEAST_SLACK_M)
-    # Each camera spares the next ones the places that it finds safe.
-    for table in tables:
-        if not len(unsafe):
-            return phantom
-        points = vertices[unsafe] - _NUDGE_M * normals[unsafe]
-        seen = np.flatnonzero(table.ask_points(points.T) == INSIDE)
-        starts = np.broadcast_to(table.centre, (len(seen), 3))
-        once = scene.n_crossings(starts, points[seen] - table.centre) <= 2
-        unsafe = np.delete(unsafe, seen[once])
+    for depth_m in _DEPTHS_M:
+        room = scene.first_hits(vertices[unsafe] - _LEAST_M * normals[unsafe], -normals[unsafe])
+        deep = (room > 2 * depth_m) | (depth_m == _DEPTHS_M[0])
+        asked = unsafe[deep]
+        # Each camera spares the next ones the places that it finds safe.
+        for table in tables:
+            points = vertices[asked] - depth_m * normals[asked]
+            seen = np.flatnonzero(table.ask_points(points.T) == INSIDE)
+            starts = np.broadcast_to(table.centre, (len(seen), 3))
+            once = scene.n_crossings(starts, points[seen] - table.centre) <= 2
+            asked = np.delete(asked, seen[once])
+        unsafe = np.concatenate([unsafe[~deep], asked])
     phantom[unsafe] = True
     return _large_patches(phantom, vertices, faces)
 
