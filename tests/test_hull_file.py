@@ -25,7 +25,7 @@ def hull() -> Hull:
         CameraFault(2, "cam2", FaultKind.MOVED, FaultAction.LEFT_OUT, 0.1, 0.2, (10.0, -0.5)),
         CameraFault(4, "cam4", FaultKind.PART_MISSING, FaultAction.REGION_UNKNOWN, 1 / 3),
     )
-    return replace(made, colours=colours, problems=("one", "two, with ünïcode"), faults=faults)
+    return replace(made, colours=colours, problems=("one", "two, ünïcode"), faults=faults, marks=("one",))
 
 
 def test_what_is_saved_comes_back(hull: Hull, tmp_path: Path) -> None:
