@@ -50,7 +50,6 @@ def save_hull(path: Path | str, hull: Hull) -> None:
                 checksum=np.int64(_checksum(hull.vertices)),
                 problems=np.array(json.dumps(list(hull.problems))),
                 marks=np.array(json.dumps(list(hull.marks))),
-                marks=np.array(json.dumps(list(hull.marks))),
                 faults=np.array(json.dumps([asdict(fault) for fault in hull.faults])),
                 **{name: getattr(hull, name).astype(kind) for name, kind in _KINDS.items()},
             )
@@ -74,7 +73,6 @@ def load_hull(path: Path | str) -> Hull:
         with beside.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             found = {name: archive[name] for name in archive.files}
         problems = tuple(json.loads(str(found["problems"])))
-        marks = tuple(json.loads(str(found["marks"])))
         marks = tuple(json.loads(str(found["marks"])))
         faults = tuple(_fault(values) for values in json.loads(str(found["faults"])))
         checksum = int(found["checksum"])
