@@ -21,6 +21,8 @@ from hull.witnesses import WORD_BITS, WitnessRule
 # nothing.
 COARSEST_LEVEL = 5
 
+# So many cells are split together.
+_AT_ONCE = 64_000
 # How often the space searched for a person is halved at once.
 _FIRST_HALVINGS = 3
 
@@ -103,6 +105,21 @@ class _Front:
         """Who may see some of the cell inside."""
         return rule.full()[:, None] & ~self.without
 
+    def parts(self) -> list[_Front]:
+        """In parts that fit into the processor's cache with their children; one at least."""
+        known = (self.cells, self.unasked, self.without, self.n_outside)
+        starts = range(0, max(self.cells.shape[1], 1), _AT_ONCE)
+        return [_Front(*(each[..., start : start + _AT_ONCE] for each in known)) for start in starts]
+
+    @staticmethod
+    def of_parts(parts: Sequence[_Front]) -> _Front:
+        if len(parts) == 1:
+            return parts[0]
+        columns = zip(
+            *((part.cells, part.unasked, part.without, part.n_outside) for part in parts), strict=True
+        )
+        return _Front(*(np.concatenate(each, axis=-1) for each in columns))
+
     def halved(self) -> Int[np.ndarray, "3 m"]:
         """Each cell's eight children, next to each other."""
         return (2 * self.cells[:, :, None] + _CHILDREN[:, None, :]).reshape(3, -1)
@@ -115,23 +132,30 @@ def carve(tables: Sequence[SilhouetteTable], rule: WitnessRule, grid: Grid, vote
     """
     coarsest = min(COARSEST_LEVEL, max(int(np.log2(max(grid.shape))), 0))
     front = _first_front(rule, [-(-n >> coarsest) for n in grid.shape])
-    cells = front.cells
     found: list[np.ndarray] = []
     order = list(range(len(tables)))
     for level in range(coarsest, 0, -1):
         side = 1 << level
         # Only voxel centres are asked for in the end, so a cell reaches from its first to its last centre.
         half_m = 0.5 * (side - 1) * grid.voxel_m
-        within = np.asarray((cells * side < np.array(grid.shape)[:, None]).all(axis=0))
-        front = _ask(tables, rule, front, cells, within, grid.centres(cells, side), half_m, votes, order)
-        decided = np.asarray(~front.unasked.any(axis=0))
-        sure = front.kept(decided)
-        found.append(sure.cells[:, rule.enough(sure.inside(rule))])
-        front = front.kept(~decided)
-        cells = front.halved()
-    within = np.asarray((cells < np.array(grid.shape)[:, None]).all(axis=0))
-    chosen = _ask_voxels(tables, rule, front, within, grid.centres(cells), votes, order)
-    found.append(cells[:, chosen])
+        sure_cells, open_fronts = [], []
+        for part in front.parts():
+            cells = part.cells if level == coarsest else part.halved()
+            within = np.asarray((cells * side < np.array(grid.shape)[:, None]).all(axis=0))
+            asked = _ask(tables, rule, part, cells, within, grid.centres(cells, side), half_m, votes, order)
+            decided = np.asarray(~asked.unasked.any(axis=0))
+            sure = asked.kept(decided)
+            sure_cells.append(sure.cells[:, rule.enough(sure.inside(rule))])
+            open_fronts.append(asked.kept(~decided))
+        found.append(np.concatenate(sure_cells, axis=1))
+        front = _Front.of_parts(open_fronts)
+    voxels = []
+    for part in front.parts():
+        cells = part.halved() if coarsest else part.cells
+        within = np.asarray((cells < np.array(grid.shape)[:, None]).all(axis=0))
+        chosen = _ask_voxels(tables, rule, part, within, grid.centres(cells), votes, order)
+        voxels.append(cells.take(chosen, axis=1))
+    found.append(np.concatenate(voxels, axis=1))
     found = found[::-1]
     cut_at_the_grid(found, grid)
     return Blocks(grid, tuple(found))

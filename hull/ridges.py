@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from hull.culling import Culling
-from hull.surface import Crossings, by_table, exits
+from hull.surface import AT_ONCE, Crossings, by_table, exits
 from hull.tables import OUTSIDE, SilhouetteTable
 
 # In voxels: edges whose middle is deeper than the first are split; nothing is moved further than the second.
@@ -44,7 +44,13 @@ def raise_ridges(
     middle = 0.5 * (columns.take(a, axis=1) + columns.take(b, axis=1))
     places = middle + _DEPTH_SPLIT * way
     deep = np.flatnonzero(length > 0.5)
-    deep = _still_inside(tables, places, deep, cut_by[a], cut_by[b], culling, votes)
+    ends_cut_by = cut_by.take(a), cut_by.take(b)
+    deep = np.concatenate(
+        [
+            _still_inside(tables, places, deep[start : start + AT_ONCE], *ends_cut_by, culling, votes)
+            for start in range(0, max(len(deep), 1), AT_ONCE)
+        ]
+    )
     middle, way = middle.take(deep, axis=1), _FARTHEST * way.take(deep, axis=1)
     exit_at, new_cut_by = exits(tables, middle, way, culling, votes)
     ends = new_cut_by >= 0

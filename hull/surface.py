@@ -18,10 +18,13 @@ from hull.culling import Culling
 from hull.marching import GridSurface
 from hull.tables import OUTSIDE, SilhouetteTable
 
-# A way this many pixels long is halved until a pixel is left; longer ones stay that much coarser.
+# The way is halved until this many pixels are left of it; a very long one stays that much coarser.
+_BRACKET_PX = 1.5
 _MOST_HALVED = 128.0
 # Then to a hundredth of a pixel.
 _N_FALSE_POSITIONS = 3
+# More places are asked in parts: what is looked at together should fit into the processor's cache.
+AT_ONCE = 200_000
 # Crossings keep this share of the edge from its ends, so that no triangle collapses onto a grid point.
 KEEP_OFF = 0.02
 
@@ -75,6 +78,10 @@ def exits(
     The exit is thus the first one of all cameras, found with little more than one question per camera.
     Cameras that cannot refuse any of it are not asked where `culling` is given.
     """
+    if (n := origin.shape[1]) > AT_ONCE:
+        parts = [slice(start, start + AT_ONCE) for start in range(0, n, AT_ONCE)]
+        found = [exits(tables, origin[:, part], along[:, part], culling, votes) for part in parts]
+        return np.concatenate([at for at, _ in found]), np.concatenate([by for _, by in found])
     if votes > 1:
         return _exits_by_votes(tables, origin, along, culling, votes)
     # `take` gathers columns five times as fast as an index does, if each row lies in one piece.
@@ -152,31 +159,39 @@ def way_out(
 ) -> Float[np.ndarray, " n"]:
     """(N,) where the silhouette's value falls to one half, between 0 (inside) and `outer` (outside).
 
-    Halvings until a pixel is left, where the value begins to tell how far the outline is; then false
+    Halvings until a pixel or so is left, where the value begins to tell how far the outline is; then false
     position (Illinois), which keeps its bracket.
     """
-    inner, inner_value = np.zeros(len(outer)), np.ones(len(outer))
-    outer_value = table.ask_along(base, way, outer)
     end = base + way * outer
-    length = np.abs(end[:2] / end[2] - base[:2] / base[2]).max(axis=0)
-    n_halvings = int(np.ceil(np.log2(np.clip(length.max(), 1.0, _MOST_HALVED))))
-    halved = np.zeros(len(outer), dtype=np.int8)
+    if not base[2].min(initial=1.0) > 0.0:
+        # The camera stands inside the hull, within a voxel of its end: nobody knows better than half way.
+        behind = base[2] <= 0.0
+        result = 0.5 * outer
+        result[~behind] = way_out(table, base[:, ~behind], way[:, ~behind], outer[~behind])
+        return result
+    # In the picture the way is a straight line: the search goes along that, and needs no division.
+    u, v = base[:2] / base[2]
+    du, dv = end[:2] / end[2] - (u, v)
+    length = float(np.maximum(np.abs(du).max(), np.abs(dv).max()))
+    n_halvings = int(np.ceil(np.log2(np.clip(length / _BRACKET_PX, 1.0, _MOST_HALVED))))
+    near, near_value = np.zeros(len(outer)), np.ones(len(outer))
+    far, far_value = np.ones(len(outer)), np.zeros(len(outer))
+    moved = np.zeros(len(outer), dtype=bool)
     for step in range(n_halvings + _N_FALSE_POSITIONS):
         if step < n_halvings:
-            place = 0.5 * (inner + outer)
+            place = 0.5 * (near + far)
         else:
-            span = inner_value - outer_value
-            place = inner + (outer - inner) * ((inner_value - 0.5) / np.maximum(span, 1e-9))
-        value = table.ask_along(base, way, place)
+            place = near + (far - near) * ((near_value - 0.5) / (near_value - far_value))
+        value = table.ask_pixels(u + du * place, v + dv * place)
         outside = value < 0.5
-        if step >= n_halvings:
+        if step > n_halvings:
             # The end that stays twice counts half: false position would creep from one side otherwise.
-            stays_outer = ~outside & (halved == 1)
-            stays_inner = outside & (halved == 2)
-            outer_value = np.where(stays_outer, 0.5 - 0.5 * (0.5 - outer_value), outer_value)
-            inner_value = np.where(stays_inner, 0.5 + 0.5 * (inner_value - 0.5), inner_value)
-            halved = np.where(outside, 2, 1).astype(np.int8)
-        outer, outer_value = np.where(outside, place, outer), np.where(outside, value, outer_value)
-        inner, inner_value = np.where(outside, inner, place), np.where(outside, inner_value, value)
-    span = np.maximum(inner_value - outer_value, 1e-9)
-    return inner + (outer - inner) * ((inner_value - 0.5) / span)
+            again = outside == moved
+            near_value = np.where(again & outside, 0.25 + 0.5 * near_value, near_value)
+            far_value = np.where(again & ~outside, 0.25 + 0.5 * far_value, far_value)
+        moved = outside
+        far, far_value = np.where(outside, place, far), np.where(outside, value, far_value)
+        near, near_value = np.where(outside, near, place), np.where(outside, near_value, value)
+    place = near + (far - near) * ((near_value - 0.5) / (near_value - far_value))
+    # Back from the share of the picture's line to the share of the way, which recedes from the camera.
+    return outer * place * base[2] / (place * base[2] + (1.0 - place) * end[2])

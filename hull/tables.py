@@ -84,19 +84,9 @@ class SilhouetteTable:
         _, outline, _ = self._looked_up(*self._pixels(points))
         return outline
 
-    def ask_along(
-        self,
-        base: Float[np.ndarray, "3 n"],
-        way: Float[np.ndarray, "3 n"],
-        share: Float[np.ndarray, " n"],
-    ) -> Float[np.ndarray, " n"]:
-        """(N,) how much of a person there is at `base + share * way`: below one half is OUTSIDE.
-
-        `base`, `way`: points and ways as `projected` and `projected_way` give them. Without evidence 1: such
-        a place is not refused.
-        """
-        u, v, depth = base + way * share
-        answers, outline, value = self._looked_up(*_divided(u, v, depth))
+    def ask_pixels(self, u: Float[np.ndarray, " n"], v: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """(N,) how much of a person there is at pixels: below one half is OUTSIDE; without evidence 1."""
+        answers, outline, value = self._looked_up(u, v, None)
         result = (answers != OUTSIDE).astype(np.float64)
         result[outline] = value
         return result

@@ -111,7 +111,8 @@ def _pixels_to_the_outline(table: SilhouetteTable, points: np.ndarray, ends: np.
     low, high = -reach, reach
     for _ in range(16):
         middle = 0.5 * (low + high)
-        outside = table.ask_along(base, way, middle) < 0.5
+        u, v, depth = base + way * middle
+        outside = table.ask_pixels(u / depth, v / depth) < 0.5
         low, high = np.where(outside, low, middle), np.where(outside, middle, high)
     return np.abs(0.5 * (low + high)) * px
 
