@@ -35,7 +35,7 @@ LARGEST_SHARE_OUT = 0.25
 MENDED_BELOW = 24
 # A camera is at fault when it forbids this share of the others' lines and so many times the typical camera's
 # share, or this share deeply (far from its outline); two of the others at least must have such lines.
-_SHARE, _FACTOR, _DEEP_SHARE, _N_ACCUSERS = 0.01, 5.0, 0.001, 2
+_SHARE, _FACTOR, _DEEP_SHARE, _N_ACCUSERS = 0.01, 5.0, 0.0005, 2
 # A camera shows too much when two others refuse this share of its lines, and so many times the typical share.
 _SURPLUS_SHARE = 0.1
 _MOST_ROUNDS = 8
