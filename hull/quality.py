@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Integer
 
 from capture.camera import Camera
-from hull.bounds import Bounds, bounds_from_tables
-from hull.carve import carve
-from hull.cleaning import face_pieces, piece_volumes
 from hull.coverage import Coverage, NotClosedError
-from hull.diagnosis import why_empty
 from hull.errors import HullError
-from hull.marching import binary_surface
 from hull.rays import RayScene
-from hull.surface import cross_exactly
-from hull.tables import BORDER_PX, UNKNOWN, prepare_tables
-from hull.visual_hull import Hull, grid_over
-from hull.witnesses import witness_rule
+from hull.tables import BORDER_PX, UNKNOWN
+from hull.visual_hull import Hull
 
 # A camera is suspicious when it lacks or adds more than this share, and this many times more than the typical
 # camera.
@@ -140,71 +131,6 @@ def _outline(mask: Bool[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]) -> F
     return np.concatenate([np.argwhere(across) + half_right, np.argwhere(along) + half_down])
 
 
-@dataclass(frozen=True)
-class CameraDisagreement:
-    """One camera against what the others agree on, as shares of that shape's area in its picture.
-
-    Fields
-    ------
-    missing : covered by the shape that (almost) all cameras agree on, but background in this silhouette.
-    surplus : person in this silhouette, but not covered by that shape.
-    suspicious : either is large, and much larger than in the rig's typical camera.
-    """
-
-    name: str
-    missing: float
-    surplus: float
-    suspicious: bool
-
-
-def camera_disagreements(
-    rig: Iterable[Camera],
-    images: Sequence[np.ndarray | None],
-    voxel_m: float = 0.02,
-    bounds: Bounds | None = None,
-) -> tuple[CameraDisagreement, ...]:
-    """Which silhouettes do not fit the others. One entry per camera that gave one, in the rig's order.
-
-    The measure is the hull in which two cameras are needed to carve: a silhouette that lacks a part cannot
-    cut it, so the part shows up as missing there; agreement with the ordinary hull would blame all the
-    others. Four silhouettes at least are needed for that; with fewer the ordinary hull is used.
-    """
-    cameras = tuple(rig)
-    tables = prepare_tables(cameras, images)
-    box = bounds_from_tables(tables) if bounds is None else bounds
-    rule = witness_rule(tables, box.centre)
-    votes = 2 if len(tables) >= 4 else 1
-    grid = grid_over(box, voxel_m)
-    blocks = carve(tables, rule, grid, votes=votes)
-    if not blocks.n_voxels:
-        raise HullError(why_empty(tables, rule, box.low, box.high))
-    surface = binary_surface(blocks)
-    # Exits are those of every camera alike, so the vertices stay in the middle where two votes are needed.
-    middle = 0.5 * (grid.centres(surface.inner.T) + grid.centres(surface.outer.T)).T
-    vertices = cross_exactly(surface, grid, tables).vertices if votes == 1 else middle
-    # With a vote to spare there are more phantoms; the person is the largest piece.
-    label = face_pieces(surface.faces, len(vertices))
-    largest = int(np.argmax(piece_volumes(vertices, surface.faces, label)))
-    scene = RayScene(vertices, surface.faces[label == largest])
-    shares = []
-    for table in tables:
-        camera, image = cameras[table.camera_idx], images[table.camera_idx]
-        assert image is not None
-        covered, known, person = scene.mask(camera), image != UNKNOWN, image > UNKNOWN
-        area = max(int((covered & known).sum()), 1)
-        # The two-vote shape is a little wider than each silhouette anyway: only what is deeper than that
-        # counts.
-        lacking = _core(covered & known & ~person)
-        extra = _core(person & known & ~covered)
-        shares.append((lacking / area, extra / area))
-    missing, surplus = np.array(shares).T
-    limits = [max(_SUSPICIOUS_SHARE, _SUSPICIOUS_FACTOR * float(np.median(v))) for v in (missing, surplus)]
-    return tuple(
-        CameraDisagreement(table.name, float(m), float(s), bool(m > limits[0] or s > limits[1]))
-        for table, m, s in zip(tables, missing, surplus, strict=True)
-    )
-
-
 def suspicious_cameras(scores: Float[np.ndarray, " c"], names: Sequence[str]) -> tuple[str, ...]:
     """Names of the cameras whose agreement (C,) is much worse than the rest's; NaN entries pass."""
     shortfall = 1.0 - scores
@@ -224,12 +150,6 @@ def signed_distance(
 def share_outside(points: Float[np.ndarray, "n 3"], hull: Hull, tolerance_m: float = 0.0) -> float:
     """The share of points that lie more than `tolerance_m` outside the hull."""
     return float((signed_distance(points, hull.vertices, hull.faces) > tolerance_m).mean())
-
-
-def _core(region: Bool[np.ndarray, "h w"]) -> int:
-    """Pixels of the parts of a region that are thicker than a seam (nine pixels), at their full size."""
-    opened = cv2.morphologyEx(region.astype(np.uint8), cv2.MORPH_OPEN, np.ones((9, 9), np.uint8))
-    return int(opened.sum())
 
 
 def _check_size(camera: Camera, image: np.ndarray) -> None:

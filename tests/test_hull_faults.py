@@ -145,6 +145,21 @@ def test_how_far_a_silhouette_is_moved_is_told(sixteen: Case) -> None:
     assert re_found("is moved by about (9|10|11) px to the right", fault)
 
 
+def test_a_camera_that_shows_too_much_is_told_of_and_kept(sixteen: Case) -> None:
+    """It cuts nothing by that; the hull is the same as without it."""
+
+    def with_a_shadow(image: Image) -> Image:
+        image[40:160, 40:160] = 255
+        return image
+
+    hull = sixteen.hull({7: with_a_shadow})
+    assert [f.name for f in hull.faults] == [sixteen.rig[7].name]
+    assert (hull.faults[0].kind, hull.faults[0].action) == (FaultKind.TOO_MUCH, FaultAction.KEPT)
+    assert hull.faults[0].surplus > 0.1
+    assert hull.problems[-1].endswith("of its lines of sight); it cuts nothing by that")
+    assert abs(sixteen.change(hull)) < 0.01
+
+
 def test_several_cameras_may_be_wrong_at_once(sixteen: Case) -> None:
     wrong = {1: without_the_lower_part, 6: inverted, 11: shifted, 14: empty}
     hull = sixteen.hull(wrong)
