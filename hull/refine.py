@@ -25,8 +25,8 @@ from hull.tables import SilhouetteTable
 
 # The plate is held by this at a slack of one centimetre, and by the square of the slack's inverse.
 _HOLD, _HOLD_AT_M = 1e-3, 0.01
-# A vertex that is called back is held at least by this, and each time so many times more.
-_CALLED_BACK, _CALLED_AGAIN = 5.0, 30.0
+# A vertex that is called back is held at least by this, and each time so many times more, up to the last.
+_CALLED_BACK, _CALLED_AGAIN, _HELD_FAST = 5.0, 30.0, 1e8
 # Rounds of bending, then rounds in which what is still called goes back all the way.
 _N_BENDINGS, _N_RETURNS = 6, 3
 # Solved no better than this: it is bent again anyway, and far-off places need not hear of each other.
@@ -96,18 +96,16 @@ def refined(
             moved, _ = cg(plate + diags_array(hold), push, x0=moved, maxiter=_N_STEPS, rtol=_TOLERANCE)
             moved = np.clip(moved, 0.0, farthest)
         now = RayScene(vertices - moved[:, None] * normals, faces, n_threads=1)
-        any_lost = False
-        for rim in rims:
-            lost = rim.lost(now)
-            if not lost.any():
-                continue
-            any_lost = True
-            called = rim.called(lost, moved, all_of_them=step == _N_BENDINGS + _N_RETURNS - 1)
+        last = step == _N_BENDINGS + _N_RETURNS - 1
+        lost = [rim.lost(now) for rim in rims]
+        called = [rim.called(gone, moved, last) for rim, gone in zip(rims, lost, strict=True) if gone.any()]
+        if called:
+            back = np.unique(np.concatenate(called))
             if bending:
-                hold[called] = np.maximum(_CALLED_AGAIN * hold[called], _CALLED_BACK)
+                hold[back] = np.clip(_CALLED_AGAIN * hold[back], _CALLED_BACK, _HELD_FAST)
             else:
-                moved[called] = 0.0
-        if not bending and not any_lost:
+                moved[back] = 0.0
+        elif not bending:
             break
     return vertices - moved[:, None] * normals
 

