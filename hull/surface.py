@@ -18,10 +18,12 @@ from hull.culling import Culling
 from hull.marching import GridSurface
 from hull.tables import OUTSIDE, SilhouetteTable
 
+# An end that rounding puts on the outline's other side counts as just on its own.
+_BELOW_HALF = float(np.nextafter(0.5, 0.0))
 # The way is halved until this many pixels are left of it; a very long one stays that much coarser.
-_BRACKET_PX = 1.5
+_BRACKET_PX = 1.0
 _MOST_HALVED = 128.0
-# Then to a hundredth of a pixel.
+# Then to a hundredth of a pixel, nearly always to far less.
 _N_FALSE_POSITIONS = 3
 # More places are asked in parts: what is looked at together should fit into the processor's cache.
 AT_ONCE = 200_000
@@ -174,14 +176,14 @@ def way_out(
     du, dv = end[:2] / end[2] - (u, v)
     length = float(np.maximum(np.abs(du).max(), np.abs(dv).max()))
     n_halvings = int(np.ceil(np.log2(np.clip(length / _BRACKET_PX, 1.0, _MOST_HALVED))))
-    near, near_value = np.zeros(len(outer)), np.ones(len(outer))
-    far, far_value = np.ones(len(outer)), np.zeros(len(outer))
+    near, near_value = np.zeros(len(outer)), np.maximum(table.ask_pixels(u, v), 0.5)
+    far, far_value = np.ones(len(outer)), np.minimum(table.ask_pixels(u + du, v + dv), _BELOW_HALF)
     moved = np.zeros(len(outer), dtype=bool)
     for step in range(n_halvings + _N_FALSE_POSITIONS):
         if step < n_halvings:
             place = 0.5 * (near + far)
         else:
-            place = near + (far - near) * ((near_value - 0.5) / (near_value - far_value))
+            place = near + (far - near) * ((near_value - 0.5) / np.maximum(near_value - far_value, 1e-9))
         value = table.ask_pixels(u + du * place, v + dv * place)
         outside = value < 0.5
         if step > n_halvings:
@@ -192,6 +194,6 @@ def way_out(
         moved = outside
         far, far_value = np.where(outside, place, far), np.where(outside, value, far_value)
         near, near_value = np.where(outside, near, place), np.where(outside, near_value, value)
-    place = near + (far - near) * ((near_value - 0.5) / (near_value - far_value))
+    place = near + (far - near) * ((near_value - 0.5) / np.maximum(near_value - far_value, 1e-9))
     # Back from the share of the picture's line to the share of the way, which recedes from the camera.
     return outer * place * base[2] / (place * base[2] + (1.0 - place) * end[2])
