@@ -174,7 +174,7 @@ def way_out(
     # In the picture the way is a straight line: the search goes along that, and needs no division.
     u, v = base[:2] / base[2]
     du, dv = end[:2] / end[2] - (u, v)
-    length = float(np.maximum(np.abs(du).max(), np.abs(dv).max()))
+    length = max(float(np.abs(du).max(initial=0.0)), float(np.abs(dv).max(initial=0.0)))
     n_halvings = int(np.ceil(np.log2(np.clip(length / _BRACKET_PX, 1.0, _MOST_HALVED))))
     near, near_value = np.zeros(len(outer)), np.maximum(table.ask_pixels(u, v), 0.5)
     far, far_value = np.ones(len(outer)), np.minimum(table.ask_pixels(u + du, v + dv), _BELOW_HALF)

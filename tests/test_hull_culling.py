@@ -13,7 +13,7 @@ from hull.cleaning import is_closed, vertex_normals
 from hull.culling import Culling
 from hull.marching import binary_surface
 from hull.ridges import raise_ridges
-from hull.surface import cross_exactly
+from hull.surface import cross_exactly, way_out
 from hull.tables import NO_EVIDENCE, OUTSIDE, UNKNOWN, SilhouetteTable, prepare_tables
 from hull.visual_hull import grid_over
 from hull.witnesses import witness_rule
@@ -101,6 +101,22 @@ def test_a_crossing_lies_where_the_silhouette_is_one_half() -> None:
         assert np.percentile(errors, 95) < 0.1, (
             f"95 % below {np.percentile(errors, 95):.3f} px at {voxel_m} m"
         )
+
+
+def test_a_way_that_begins_behind_the_camera_ends_half_way() -> None:
+    rig, images = _scenes()["clean"]
+    table = prepare_tables(rig, images)[0]
+    forward = table.projection[2, :3] / np.linalg.norm(table.projection[2, :3])
+    starts = table.centre[:, None] + forward[:, None] * np.array([-0.2, -0.1, 0.3])
+    ways = np.repeat(forward[:, None], 3, axis=1)
+    base, way = table.projected(starts), table.projected_way(ways)
+    some, all_ = (
+        way_out(table, base, way, np.full(3, 0.8)),
+        way_out(table, base[:, :2], way[:, :2], np.ones(2)),
+    )
+    assert some[:2].tolist() == [0.4, 0.4]
+    assert 0 <= some[2] <= 0.8
+    assert all_.tolist() == [0.5, 0.5]
 
 
 def _pixels_to_the_outline(table: SilhouetteTable, points: np.ndarray, ends: np.ndarray) -> np.ndarray:
