@@ -68,7 +68,7 @@ def trust(slack_m: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
 
     The median slack over the slack, to a power that grows with the median: nought up to 3 cm, so that a hull
     from many cameras counts evenly (weights bring nothing there), one from 8 cm on. With four cameras it
-    takes 28 % off the body's error in one of the people's recordings and 6 % in another.
+    takes 28 % off the body's error in one of the people's recordings and 5 % in another.
     """
     middle = float(np.median(slack_m))
     power = float(np.clip((middle - _TIGHT_M) / (_LOOSE_M - _TIGHT_M), 0.0, 1.0))
