@@ -13,7 +13,7 @@ from tests.command_line import call
 Capture = pytest.CaptureFixture[str]
 RUN = (
     "RECORDING --out --sequence --body --calibration --frames --voxel-mm --units --up --background "
-    "--keypoints --pose-prior --no-colours --votes --soft --no-find-faults --overwrite"
+    "--keypoints --pose-prior --no-colours --votes --soft --no-find-faults --refine --overwrite"
 )
 COMMANDS = {
     "run": RUN,
@@ -73,12 +73,12 @@ def test_options_arrive_in_the_configuration(taken: list[object], capsys: Captur
         capsys, "run", "rec", "--out", "there", "--sequence", "walk", "--body", "free:male",
         "--calibration", "c.json", "--frames", "0:100:5", "--voxel-mm", "5", "--units", "mm", "--up", "-y",
         "--background", "plates", "--keypoints", "openpose", "--overwrite",
-        "--pose-prior", "prior.npz", "--no-colours", "--votes", "2", "--soft", "--no-find-faults",
+        "--pose-prior", "prior.npz", "--no-colours", "--votes", "2", "--soft", "--no-find-faults", "--refine",
     )  # fmt: skip
     assert taken == [
         cli.Run(
             Path("rec"), Path("there"), "walk", "free:male", Path("c.json"), "0:100:5", 5.0, "mm", "-y",
-            Path("plates"), Path("openpose"), True, Path("prior.npz"), False, 2, True, False,
+            Path("plates"), Path("openpose"), True, Path("prior.npz"), False, 2, True, False, True,
         )
     ]  # fmt: skip
 
