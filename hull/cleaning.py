@@ -66,15 +66,18 @@ def face_pieces(faces: Int[np.ndarray, "f 3"], n_vertices: int) -> Int[np.ndarra
     n_pieces, of_vertex = connected_components(graph.tocsr(), directed=False)
     if n_pieces == 1:
         return np.zeros(len(faces), dtype=np.int64)
-    return np.unique(of_vertex[faces[:, 0]], return_inverse=True)[1].ravel()
+    label = of_vertex[faces[:, 0]]
+    used = np.bincount(label, minlength=n_pieces) > 0  # vertices without faces are pieces of their own
+    return (np.cumsum(used) - 1)[label]
 
 
 def piece_volumes(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], label: Int[np.ndarray, " f"]
 ) -> Float[np.ndarray, " p"]:
     """Signed volume, cubic metres, of each closed piece; positive where the faces look outward."""
-    a, b, c = (vertices[faces[:, k]] - vertices.mean(axis=0) for k in range(3))
-    return np.bincount(label, np.einsum("fi,fi->f", a, np.cross(b, c)) / 6.0)
+    centred = vertices - vertices.mean(axis=0)
+    a, b, c = (centred[faces[:, k]] for k in range(3))
+    return np.bincount(label, np.einsum("fi,fi->f", a, _crossed(b, c)) / 6.0)
 
 
 def compacted(
