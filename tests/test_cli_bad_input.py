@@ -31,7 +31,11 @@ def frame(recording: Path, frame_id: int) -> dict:
 
 
 def carved(recording: Path) -> list[str]:
-    return sorted(path.name for path in (recording.parent / "run" / "hull").iterdir())
+    """The meshes in the run; what their vertices know lies beside each."""
+    folder = recording.parent / "run" / "hull"
+    meshes = sorted(path.name for path in folder.glob("*.ply"))
+    assert sorted(path.stem for path in folder.glob("*.npz")) == [name[:-4] for name in meshes]
+    return meshes
 
 
 def blank(recording: Path, camera_idx: int, frame_id: int) -> None:
