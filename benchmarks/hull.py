@@ -20,6 +20,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing.queues import Queue
 from pathlib import Path
 
 import cv2
@@ -293,7 +294,7 @@ def _open3d_dense(case: Case):  # type: ignore[no-untyped-def]  # open3d ships n
     )
 
 
-def _measure(row: Row, settings: Settings, queue) -> None:  # type: ignore[no-untyped-def]
+def _measure(row: Row, settings: Settings, queue: Queue[tuple[float, float, str]]) -> None:
     cv2.setNumThreads(1)
     case = Case(settings)
     seconds: list[float] = []

@@ -42,7 +42,7 @@ class RigStudy:
     mask_px: tuple[float, ...] = (0.0, 1.0, 2.0, 4.0)
     """Mask noises to try: outlines wander by this much."""
     base_cameras: int = 16
-    """How many cameras where something else is tried."""
+    """How many cameras where something else is tried; all of them with --calibration."""
     base_width: int = 1024
     """Picture width where something else is tried."""
     frames: int = 8

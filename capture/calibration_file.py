@@ -46,11 +46,16 @@ def read_calibration(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Calibr
         raise RecordingError(f"{path}: no such calibration; give one with --calibration FILE")
     if path.is_dir():
         return _read_matrix_folder(path, sizes)
+    return _paired(*read_rig_file(path), path, sizes)
+
+
+def read_rig_file(path: Path) -> tuple[Rig, str]:
+    """Every camera of a rig .json or a Qualisys .qca.txt, and the file's unit. Raises RecordingError."""
     suffix = "".join(path.suffixes).lower()
     if suffix.endswith(".json"):
-        return _paired(Rig.load(path), "m", path, sizes)
+        return Rig.load(path), "m"
     if suffix.endswith((".qca.txt", ".qca", ".xml")) or path.read_bytes()[:512].lstrip().startswith(b"<"):
-        return _paired(read_qualisys(path), QUALISYS_UNIT, path, sizes)
+        return read_qualisys(path), QUALISYS_UNIT
     raise RecordingError(
         f"{path}: unknown calibration format; known are a folder of camNN.txt (3x4 matrices), "
         "a Qualisys .qca.txt and a rig .json"

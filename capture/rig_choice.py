@@ -12,11 +12,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from capture.calibration_file import read_rig_file
 from capture.camera import Camera
 from capture.errors import RecordingError
 from capture.formats.inria import list_matrix_files, read_inria_camera
-from capture.formats.qualisys import UNIT as QUALISYS_UNIT
-from capture.formats.qualisys import read_qualisys
 from capture.rig import Rig
 from capture.world import find_subject, settle_world
 
@@ -42,14 +41,8 @@ def read_rig(path: Path, size: tuple[int, int] | None = None) -> tuple[Rig, str 
             )
         cameras = [read_inria_camera(file, f"cam-{number:03d}", size) for number, file in files.items()]
         return Rig(tuple(cameras)), None
-    if path.suffix.lower() == ".json":
-        return Rig.load(path).pinholes(), "m"
-    if path.name.lower().endswith((".qca.txt", ".qca", ".xml")):
-        return read_qualisys(path).pinholes(), QUALISYS_UNIT
-    raise RecordingError(
-        f"{path}: unknown calibration format; known are a folder of camNN.txt (3x4 matrices), "
-        "a Qualisys .qca.txt and a rig .json"
-    )
+    rig, unit = read_rig_file(path)
+    return rig.pinholes(), unit
 
 
 def stood_round_origin(rig: Rig, declared_unit: str | None, *, units: str = "auto", up: str = "auto") -> Rig:

@@ -28,10 +28,11 @@ class Culling:
     def __init__(self, tables: Sequence[SilhouetteTable], grid: Grid) -> None:
         self.tables = tuple(tables)
         # A vertex lies up to a voxel beyond the voxels' centres, and ridges are raised a little further.
+        nx, ny, nz = grid.shape
         self._blocks = Grid(
             grid.low - BLOCK_VOXELS * grid.voxel_m,
             BLOCK_VOXELS * grid.voxel_m,
-            tuple(n // BLOCK_VOXELS + 3 for n in grid.shape),  # type: ignore[arg-type]
+            (nx // BLOCK_VOXELS + 3, ny // BLOCK_VOXELS + 3, nz // BLOCK_VOXELS + 3),
         )
         self._half_m = (0.5 * BLOCK_VOXELS + REACH_VOXELS) * grid.voxel_m
         self._number = np.full(int(np.prod(self._blocks.shape)), -1, dtype=np.int32)

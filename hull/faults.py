@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -279,9 +278,4 @@ def _names(cameras: _Cameras, indices: set[int]) -> str:
     return ", ".join(f"camera {cameras.rig[idx].name}" for idx in sorted(indices))
 
 
-def entries(faults: Sequence[CameraFault]) -> list[dict[str, Any]]:
-    """JSON-ready, for run.json."""
-    return [fault.as_dict() for fault in faults]
-
-
-__all__ = ["CameraFault", "FaultAction", "FaultKind", "Settled", "entries", "settle"]
+__all__ = ["CameraFault", "FaultAction", "FaultKind", "Settled", "settle"]

@@ -30,8 +30,8 @@ class RayScene:
         self._middle = 0.5 * (self._vertices.min(axis=0) + self._vertices.max(axis=0))
         self._scene: Any = o3d.t.geometry.RaycastingScene(nthreads=n_threads)
         self._scene.add_triangles(
-            _as_tensor((self._vertices - self._middle).astype(np.float32)),
-            _as_tensor(np.ascontiguousarray(faces, dtype=np.uint32)),
+            as_tensor((self._vertices - self._middle).astype(np.float32)),
+            as_tensor(np.ascontiguousarray(faces, dtype=np.uint32)),
         )
         self._n_threads = n_threads
 
@@ -55,7 +55,7 @@ class RayScene:
         ways = columns[..., None] * inverse[:, 0] + rows[..., None] * inverse[:, 1] + inverse[:, 2]
         ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
         rays = self._rays(-inverse @ p[:, 3], ways)
-        hit = self._scene.test_occlusions(_as_tensor(rays), nthreads=self._n_threads).numpy()
+        hit = self._scene.test_occlusions(as_tensor(rays), nthreads=self._n_threads).numpy()
         covered[y_0 : y_1 + 1, x_0 : x_1 + 1] = hit
         return covered
 
@@ -64,13 +64,13 @@ class RayScene:
     ) -> Bool[np.ndarray, " n"]:
         """(N,) whether the line from `origin` through each point meets the surface, before or behind it."""
         rays = self._rays(origin, points - origin)
-        return self._scene.test_occlusions(_as_tensor(rays), nthreads=self._n_threads).numpy()
+        return self._scene.test_occlusions(as_tensor(rays), nthreads=self._n_threads).numpy()
 
     def hides(
         self, starts: Float[np.ndarray, "n 3"], ways: Float[np.ndarray, "n 3"]
     ) -> Bool[np.ndarray, " n"]:
         """(N,) whether the surface stands between each start (N 3) and the end of its way (N 3, metres)."""
-        rays = _as_tensor(self._rays(starts, ways))
+        rays = as_tensor(self._rays(starts, ways))
         # The way's length is the unit, so that nothing beyond its end counts.
         return self._scene.test_occlusions(rays, tnear=0.0, tfar=1.0, nthreads=self._n_threads).numpy()
 
@@ -78,7 +78,7 @@ class RayScene:
         self, starts: Float[np.ndarray, "n 3"], ways: Float[np.ndarray, "n 3"]
     ) -> Float[np.ndarray, " n"]:
         """(N,) metres along each unit way (N 3) from its start (N 3) to the surface; inf where it misses."""
-        rays = _as_tensor(self._rays(starts, ways))
+        rays = as_tensor(self._rays(starts, ways))
         hits = self._scene.cast_rays(rays, nthreads=self._n_threads)
         return hits["t_hit"].numpy().astype(np.float64)
 
@@ -86,19 +86,19 @@ class RayScene:
         self, starts: Float[np.ndarray, "n 3"], ways: Float[np.ndarray, "n 3"]
     ) -> Int[np.ndarray, " n"]:
         """(N,) how often each half line from a start (N 3) along a way (N 3) crosses the surface."""
-        rays = _as_tensor(self._rays(starts, ways))
+        rays = as_tensor(self._rays(starts, ways))
         return self._scene.count_intersections(rays, nthreads=self._n_threads).numpy().astype(np.int64)
 
     def meets(
         self, origins: Float[np.ndarray, "n 3"], ways: Float[np.ndarray, "n 3"]
     ) -> Bool[np.ndarray, " n"]:
         """(N,) whether the half line from each origin (N 3) along its way (N 3) meets the surface."""
-        rays = _as_tensor(self._rays(origins, ways))
+        rays = as_tensor(self._rays(origins, ways))
         return self._scene.test_occlusions(rays, nthreads=self._n_threads).numpy()
 
     def signed_distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """(N,) metres from the surface, negative inside, to about a micrometre."""
-        query = _as_tensor((points - self._middle).astype(np.float32))
+        query = as_tensor((points - self._middle).astype(np.float32))
         distance = self._scene.compute_distance(query, nthreads=self._n_threads).numpy().astype(np.float64)
         # Three rays vote, because one that grazes an edge may miscount.
         occupied = self._scene.compute_occupancy(query, nthreads=self._n_threads, nsamples=3).numpy()
@@ -113,7 +113,8 @@ class RayScene:
         return rays
 
 
-def _as_tensor(array: np.ndarray) -> Any:
+def as_tensor(array: np.ndarray) -> Any:
+    """The array as open3d wants it."""
     import open3d as o3d
 
     return o3d.core.Tensor(array)  # type: ignore[call-overload]  # the stubs do not know arrays

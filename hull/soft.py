@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt64
 
-from hull.carve import COARSEST_LEVEL, Blocks, Grid, cut_at_the_grid
+from hull.carve import COARSEST_LEVEL, Blocks, Grid, cut_at_the_grid, eighths
 from hull.culling import Culling
 from hull.marching import GridSurface
 from hull.soft_tables import LIMIT, SoftTable
@@ -22,7 +22,6 @@ from hull.witnesses import WORD_BITS, WitnessRule
 
 # A thousandth of a voxel.
 _N_HALVINGS = 10
-_CHILDREN = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.int32).T
 
 
 def carve_soft(tables: Sequence[SoftTable], rule: WitnessRule, grid: Grid) -> Blocks:
@@ -73,7 +72,7 @@ def carve_soft(tables: Sequence[SoftTable], rule: WitnessRule, grid: Grid) -> Bl
         found.append(cells[:, sure])
         hopeful = rule.enough(_packed(seen | unasked))
         split = np.flatnonzero(alive & ~sure & hopeful & unasked.any(axis=0))
-        cells = (2 * cells[:, split][:, :, None] + _CHILDREN[:, None, :]).reshape(3, -1).astype(np.int32)
+        cells = eighths(cells[:, split]).astype(np.int32)
         unasked, seen = np.repeat(unasked[:, split], 8, axis=1), np.repeat(seen[:, split], 8, axis=1)
     found = found[::-1]
     cut_at_the_grid(found, grid)

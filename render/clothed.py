@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from hull.rays import as_tensor
+
 from .scene import Surface
 
 _N_WAYS = 24
@@ -35,10 +37,10 @@ class DressedTruth:
         another one may be the nearest, so depths there are too small.
         """
         query = (points - self._middle).astype(np.float32)
-        nearest = self._all.compute_closest_points(_as_tensor(query))
+        nearest = self._all.compute_closest_points(as_tensor(query))
         offset = query - nearest["points"].numpy()
         distance = np.linalg.norm(offset, axis=1).astype(np.float64)
-        inside = self._body.compute_occupancy(_as_tensor(query), nsamples=3).numpy() > 0.5
+        inside = self._body.compute_occupancy(as_tensor(query), nsamples=3).numpy() > 0.5
         # Before the front of the nearest sheet is outside; behind it, a way out has to be looked for.
         behind = (offset * nearest["primitive_normals"].numpy()).sum(axis=1) < 0
         asked = np.flatnonzero(behind & ~inside)
@@ -55,11 +57,11 @@ class DressedTruth:
         rays = np.empty((len(query), _N_WAYS, 6), dtype=np.float32)
         rays[..., :3] = query[:, None]
         rays[..., 3:] = ways
-        free = ~self._body.test_occlusions(_as_tensor(rays)).numpy()
+        free = ~self._body.test_occlusions(as_tensor(rays)).numpy()
         of_point, of_way = np.nonzero(free)
         if not len(of_point):
             return np.ones(len(query), dtype=bool)
-        hits = self._worn.list_intersections(_as_tensor(rays[of_point, of_way]))
+        hits = self._worn.list_intersections(as_tensor(rays[of_point, of_way]))
         ray, sheet, triangle = (
             hits[name].numpy().astype(np.int64) for name in ("ray_ids", "geometry_ids", "primitive_ids")
         )
@@ -80,16 +82,10 @@ class DressedTruth:
         scene = o3d.t.geometry.RaycastingScene()
         for surface in surfaces:
             scene.add_triangles(
-                _as_tensor((surface.vertices - self._middle).astype(np.float32)),
-                _as_tensor(np.ascontiguousarray(surface.faces, dtype=np.uint32)),
+                as_tensor((surface.vertices - self._middle).astype(np.float32)),
+                as_tensor(np.ascontiguousarray(surface.faces, dtype=np.uint32)),
             )
         return scene
-
-
-def _as_tensor(array: np.ndarray) -> Any:
-    import open3d as o3d
-
-    return o3d.core.Tensor(array)  # type: ignore[call-overload]  # the stubs do not know arrays
 
 
 def _face_normals(surface: Surface) -> Float[np.ndarray, "f 3"]:
