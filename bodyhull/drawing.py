@@ -144,8 +144,9 @@ def write_run_report(config: RunConfig, recording: Recording, track: dict[str, A
     everything = [v for values in scores.values() for v in values]
     hull_frames, fit_frames = stages["hull"]["frames"], stages["fit"]["frames"]
     problems = [note for note in recording.notes if note not in recording.settled]
-    for entry in (*hull_frames.values(), *fit_frames.values()):
-        problems += [p for p in entry["problems"] if p not in problems]
+    for name, entry in (*hull_frames.items(), *fit_frames.items()):
+        told = (p if f"frame {name}" in p else f"frame {name}: {p}" for p in entry["problems"])
+        problems += [p for p in told if p not in problems]
     hull_scores = {
         name: [
             f["agreement"][k]

@@ -1,5 +1,6 @@
 """What `run` leaves behind: the files that other programs rely on, with their shapes, frames and units."""
 
+import html
 import json
 import re
 from pathlib import Path
@@ -198,3 +199,12 @@ def test_run_json_tells_how_the_run_was_made(tiny: TinyRun) -> None:
     assert {"bodyhull", "python", "numpy", "jax", "open3d"} <= set(found["software"])
     assert set(found["stages"]) == {"hull", "fit", "render"}
     json.dumps(found, allow_nan=False)
+
+
+def test_the_report_names_the_frame_of_every_problem(tiny: TinyRun) -> None:
+    page = html.unescape(tiny.folder.report.read_text("utf-8"))
+    frames = tiny.folder.read_state()["stages"]["hull"]["frames"]
+    told = [(name, problem) for name, entry in frames.items() for problem in entry["problems"]]
+    assert told
+    for name, problem in told:
+        assert (problem if f"frame {name}" in problem else f"frame {name}: {problem}") in page
