@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt64
 
+from hull.stack import stacked
 from hull.tables import INSIDE, NO_EVIDENCE, OUTSIDE, SilhouetteTable
 from hull.witnesses import WORD_BITS, WitnessRule
 
@@ -147,7 +148,7 @@ def carve(tables: Sequence[SilhouetteTable], rule: WitnessRule, grid: Grid, vote
         for part in front.parts():
             cells = part.cells if level == coarsest else part.halved()
             within = np.asarray((cells * side < np.array(grid.shape)[:, None]).all(axis=0))
-            asked = _ask(tables, rule, part, cells, within, grid.centres(cells, side), half_m, votes, order)
+            asked = _ask(tables, rule, part, cells, within, grid, side, half_m, votes, order)
             decided = np.asarray(~asked.unasked.any(axis=0))
             sure = asked.kept(decided)
             sure_cells.append(sure.cells[:, rule.enough(sure.inside(rule))])
@@ -158,7 +159,7 @@ def carve(tables: Sequence[SilhouetteTable], rule: WitnessRule, grid: Grid, vote
     for part in front.parts():
         cells = part.halved() if coarsest else part.cells
         within = np.asarray((cells < np.array(grid.shape)[:, None]).all(axis=0))
-        chosen = _ask_voxels(tables, rule, part, within, grid.centres(cells), votes, order)
+        chosen = _ask_voxels(tables, rule, part, cells, within, grid, votes, order)
         voxels.append(cells.take(chosen, axis=1))
     found.append(np.concatenate(voxels, axis=1))
     found = found[::-1]
@@ -192,8 +193,8 @@ def possible_witnesses(
             low, high = within
             alive &= ((cells + 1) * side > low[:, None]).all(axis=0)
             alive &= (cells * side < high[:, None]).all(axis=0)
-        centres = grid.centres(cells, side)
-        front = _ask(tables, rule, front, cells, alive, centres, 0.5 * side * grid.voxel_m, votes, order)
+        half_m = 0.5 * side * grid.voxel_m
+        front = _ask(tables, rule, front, cells, alive, grid, side, half_m, votes, order)
         final = np.full(front.cells.shape[1], level == 0) | ~front.unasked.any(axis=0)
         count = np.bitwise_count(front.hopeful(rule)).sum(axis=0, dtype=np.int32)[final]
         i, j, k = front.cells[:, final]
@@ -232,16 +233,61 @@ def _ask(
     parents: _Front,
     cells: Int[np.ndarray, "3 n"],
     alive: Bool[np.ndarray, " n"],
-    centres: Float[np.ndarray, "3 n"],
+    grid: Grid,
+    side: int,
     half_m: float,
     votes: int,
     order: list[int],
 ) -> _Front:
     """The front of those cells (the parents' own, or their children) that are not known to be outside.
 
-    `alive` is written into. Sorts `order`, so that the camera that rejects most is asked first on the next
-    level.
+    Cells are `side` voxels wide; what reaches `half_m` around their centres is asked about. `alive` is
+    written into. Sorts `order`, so that the camera that rejects most is asked first on the next level.
     """
+    stack = stacked(tables)
+    known = (parents.unasked, parents.without, parents.n_outside)
+    if stack is not None:
+        known_now = [np.empty((*each.shape[:-1], cells.shape[1]), dtype=each.dtype) for each in known]
+        n_asked, n_rejected, blind = stack.loops.ask_children(
+            stack.numbers,
+            stack.projections,
+            np.array(order),
+            *known,
+            cells,
+            alive,
+            grid.low,
+            side * grid.voxel_m,
+            half_m,
+            votes,
+            *known_now,
+        )
+        front = _Front(cells.astype(np.int32, copy=False), *known_now)
+        rejects = n_rejected / np.maximum(n_asked, 1)
+        hopeless = votes > 1 or blind
+    else:
+        front, rejects, hopeless = _ask_plainly(
+            tables, parents, cells, alive, grid.centres(cells, side), half_m, votes, order
+        )
+    order.sort(key=lambda camera: -float(rejects[camera]))
+    front = front.kept(alive)
+    if hopeless:
+        # Space that too few cameras can still vouch for is given up early, or it would be split to the end.
+        front = front.kept(rule.enough(front.hopeful(rule)))
+    return front
+
+
+def _ask_plainly(
+    tables: Sequence[SilhouetteTable],
+    parents: _Front,
+    cells: Int[np.ndarray, "3 n"],
+    alive: Bool[np.ndarray, " n"],
+    centres: Float[np.ndarray, "3 n"],
+    half_m: float,
+    votes: int,
+    order: Sequence[int],
+) -> tuple[_Front, Float[np.ndarray, " c"], bool]:
+    """What is known of the cells when all have been asked about them; the share that each camera saw outside;
+    and whether some camera can see nothing of one that it does not see outside."""
     family = cells.shape[1] // max(parents.cells.shape[1], 1)
     front = _Front(
         cells.astype(np.int32, copy=False),
@@ -273,28 +319,62 @@ def _ask(
             front.without[word, never] |= bit
             hopeless = hopeless or len(never) > len(outside)
         rejects[camera] = len(outside) / len(asked)
-    order.sort(key=lambda camera: -float(rejects[camera]))
-    front = front.kept(alive)
-    if hopeless:
-        # Space that too few cameras can still vouch for is given up early, or it would be split to the end.
-        front = front.kept(rule.enough(front.hopeful(rule)))
-    return front
+    return front, rejects, hopeless
 
 
 def _ask_voxels(
     tables: Sequence[SilhouetteTable],
     rule: WitnessRule,
     parents: _Front,
+    cells: Int[np.ndarray, "3 n"],
+    alive: Bool[np.ndarray, " n"],
+    grid: Grid,
+    votes: int,
+    order: Sequence[int],
+) -> Int[np.ndarray, " k"]:
+    """Which (K,) of the parents' voxels (`cells`) belong to the hull. `alive` is written into."""
+    stack = stacked(tables)
+    if stack is not None:
+        excepted = np.zeros((len(parents.unasked), cells.shape[1]), dtype=np.uint64)
+        stack.loops.ask_voxels(
+            stack.numbers,
+            stack.projections,
+            np.array(order),
+            parents.unasked,
+            parents.n_outside,
+            cells,
+            alive,
+            grid.low,
+            grid.voxel_m,
+            votes,
+            excepted,
+        )
+    else:
+        excepted = _ask_voxels_plainly(tables, parents, alive, grid.centres(cells), votes, order)
+    family = len(alive) // max(parents.cells.shape[1], 1)
+    # Whoever has been asked and has not refused sees a voxel inside, with few exceptions; so whether there
+    # are enough witnesses is a question about the parents.
+    settled = _Front(parents.cells, np.zeros_like(parents.unasked), parents.without, parents.n_outside)
+    inside = settled.inside(rule)
+    alive &= np.repeat(rule.enough(inside), family)
+    odd = np.flatnonzero(alive & (excepted != 0).any(axis=0))
+    if len(odd):
+        alive[odd] = rule.enough(inside[:, odd // family] & ~excepted[:, odd])
+    return np.flatnonzero(alive)
+
+
+def _ask_voxels_plainly(
+    tables: Sequence[SilhouetteTable],
+    parents: _Front,
     alive: Bool[np.ndarray, " n"],
     centres: Float[np.ndarray, "3 n"],
     votes: int,
-    order: list[int],
-) -> Int[np.ndarray, " k"]:
-    """Which (K,) of the parents' voxels, whose centres are given, belong to the hull. `alive` is written
-    into."""
+    order: Sequence[int],
+) -> UInt64[np.ndarray, "w n"]:
+    """For each voxel the set of cameras that were asked and do not see it inside. `alive` is written into."""
     family = len(alive) // max(parents.cells.shape[1], 1)
+    excepted = np.zeros((len(parents.unasked), len(alive)), dtype=np.uint64)
     n_outside = np.repeat(parents.n_outside, family)
-    exceptions = []
     for camera in order:
         asked = _asked(parents, camera, alive)
         if not len(asked):
@@ -303,23 +383,8 @@ def _ask_voxels(
         outside = asked[answers == OUTSIDE]
         n_outside[outside] += 1
         alive[outside[n_outside[outside] >= votes]] = False
-        if votes > 1 or (answers == NO_EVIDENCE).any():
-            exceptions.append((camera, asked[answers != INSIDE]))
-    # Whoever has been asked and has not refused sees a voxel inside, with few exceptions; so whether there
-    # are enough witnesses is a question about the parents.
-    settled = _Front(parents.cells, np.zeros_like(parents.unasked), parents.without, parents.n_outside)
-    inside = settled.inside(rule)
-    alive &= np.repeat(rule.enough(inside), family)
-    odd = np.unique(np.concatenate([voxels for _, voxels in exceptions])) if exceptions else np.zeros(0, int)
-    odd = odd[alive[odd]]
-    if len(odd):
-        sets = inside[:, odd // family]
-        for camera, voxels in exceptions:
-            places = np.searchsorted(odd, voxels)
-            hit = places[(places < len(odd)) & (odd.take(places, mode="clip") == voxels)]
-            sets[camera // WORD_BITS, hit] &= ~(np.uint64(1) << np.uint64(camera % WORD_BITS))
-        alive[odd] = rule.enough(sets)
-    return np.flatnonzero(alive)
+        excepted[camera // WORD_BITS, asked[answers != INSIDE]] |= np.uint64(1) << np.uint64(camera % WORD_BITS)
+    return excepted
 
 
 def cut_at_the_grid(cells: list[np.ndarray], grid: Grid) -> None:

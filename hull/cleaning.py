@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
+from hull.loops import mesh_loops
 from hull.rays import RayScene
 from hull.tables import INSIDE, SilhouetteTable
 
@@ -59,6 +60,16 @@ def keep_what_matters(
 
 def face_pieces(faces: Int[np.ndarray, "f 3"], n_vertices: int) -> Int[np.ndarray, " f"]:
     """(F,) number, from 0, of the connected piece each face belongs to."""
+    loops = mesh_loops()
+    if loops is None:
+        return face_pieces_plainly(faces, n_vertices)
+    label = np.empty(len(faces), dtype=np.int64)
+    loops.face_pieces(faces, np.arange(n_vertices), np.full(n_vertices, -1), label)
+    return label
+
+
+def face_pieces_plainly(faces: Int[np.ndarray, "f 3"], n_vertices: int) -> Int[np.ndarray, " f"]:
+    """`face_pieces`, not compiled."""
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     graph = coo_array(
         (np.ones(len(ends), dtype=bool), (ends[:, 0], ends[:, 1])), shape=(n_vertices, n_vertices)
@@ -75,8 +86,10 @@ def piece_volumes(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], label: Int[np.ndarray, " f"]
 ) -> Float[np.ndarray, " p"]:
     """Signed volume, cubic metres, of each closed piece; positive where the faces look outward."""
-    centred = vertices - vertices.mean(axis=0)
-    a, b, c = (centred[faces[:, k]] for k in range(3))
+    middle, loops = vertices.mean(axis=0), mesh_loops()
+    if loops is not None:
+        return loops.piece_volumes(vertices, faces, label, middle, int(label.max(initial=-1)) + 1)
+    a, b, c = ((vertices - middle)[faces[:, k]] for k in range(3))
     return np.bincount(label, np.einsum("fi,fi->f", a, _crossed(b, c)) / 6.0)
 
 
@@ -98,6 +111,22 @@ def vertex_normals(
     the stairs of a binary outline are as wide as the faces of a fine grid: on a ball it is half the error of
     weighting by angle, and no vertex is far off.
     """
+    loops = mesh_loops()
+    if loops is None:
+        return vertex_normals_plainly(vertices, faces, n_rings)
+    normals = np.zeros((len(vertices), 3))
+    loops.add_face_normals(vertices, faces, normals)
+    for _ in range(n_rings - 1):
+        last, normals = normals, np.zeros((len(vertices), 3))
+        loops.add_ring(last, faces, normals)
+    loops.make_unit(normals)
+    return normals
+
+
+def vertex_normals_plainly(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], n_rings: int
+) -> Float[np.ndarray, "v 3"]:
+    """`vertex_normals`, not compiled."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     # Twice the face's area long.
     of_face = _crossed(b - a, c - a)

@@ -11,10 +11,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8, UInt64
 
 from hull.carve import Grid
+from hull.stack import stacked
 from hull.tables import INSIDE, NO_EVIDENCE, OUTSIDE, SilhouetteTable
+from hull.witnesses import WORD_BITS
 
 # Voxels a block's side. Smaller blocks spare more questions about points and ask more about blocks.
 BLOCK_VOXELS = 4
@@ -38,15 +40,22 @@ class Culling:
         self._number = np.full(int(np.prod(self._blocks.shape)), -1, dtype=np.int32)
         self._answers = np.zeros((len(self.tables), 0), dtype=np.uint8)
         self._may_refuse = np.zeros((len(self.tables), 0), dtype=bool)
+        self._refusing_sets = np.zeros((0, -(-len(self.tables) // WORD_BITS)), dtype=np.uint64)
+        self.stack = stacked(self.tables)
 
     def blocks_of(self, places: Float[np.ndarray, "3 n"]) -> Int[np.ndarray, " n"]:
         """(N,) the block of each place (3 N), world metres: a number for `may_refuse` and `may_be_blind`."""
         low, shape = self._blocks.low, self._blocks.shape
-        i, j, k = ((places[axis] - low[axis]) * (1.0 / self._blocks.voxel_m) for axis in range(3))
-        name = i.astype(np.intp)
-        for axis, place in ((1, j), (2, k)):
-            name *= shape[axis]
-            name += place.astype(np.intp)
+        per_m = 1.0 / self._blocks.voxel_m
+        if self.stack is not None:
+            name = np.empty(places.shape[1], dtype=np.intp)
+            self.stack.loops.name_blocks(places, low, per_m, shape, name)
+        else:
+            i, j, k = ((places[axis] - low[axis]) * per_m for axis in range(3))
+            name = i.astype(np.intp)
+            for axis, place in ((1, j), (2, k)):
+                name *= shape[axis]
+                name += place.astype(np.intp)
         number = self._number.take(name)
         if number.size and number.min() < 0:
             self._ask(np.unique(name[number < 0]))
@@ -70,10 +79,29 @@ class Culling:
         mixed = INSIDE | OUTSIDE
         return np.flatnonzero((self._answers[table_idx] & mixed == mixed).take(blocks))
 
+    @property
+    def answers(self) -> UInt8[np.ndarray, "c b"]:
+        """What every table answers about every block asked so far."""
+        return self._answers
+
+    @property
+    def refusing_sets(self) -> UInt64[np.ndarray, "b w"]:
+        """For each block asked so far the set of tables that may see some of it outside."""
+        return self._refusing_sets
+
     def _ask(self, names: Int[np.ndarray, " n"]) -> None:
         self._number[names] = self._answers.shape[1] + np.arange(len(names), dtype=np.int32)
         cells = np.stack(np.unravel_index(names, self._blocks.shape))
         centres = self._blocks.centres(cells)
-        answers = np.stack([table.ask_cells(centres, self._half_m) for table in self.tables])
+        if self.stack is not None:
+            loops, numbers, projections = self.stack.loops, self.stack.numbers, self.stack.projections
+            answers = np.empty((len(self.tables), len(names)), dtype=np.uint8)
+            loops.ask_cells(numbers, projections, centres, self._half_m, answers)
+        else:
+            answers = np.stack([table.ask_cells(centres, self._half_m) for table in self.tables])
         self._answers = np.concatenate([self._answers, answers], axis=1)
         self._may_refuse = self._answers & OUTSIDE != 0
+        flags = np.zeros((len(names), self._refusing_sets.shape[1] * WORD_BITS), dtype=bool)
+        flags[:, : len(self.tables)] = (answers & OUTSIDE != 0).T
+        sets = np.packbits(flags, axis=1, bitorder="little").view("<u8").astype(np.uint64, copy=False)
+        self._refusing_sets = np.concatenate([self._refusing_sets, sets])

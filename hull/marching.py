@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt8
 
 from hull.carve import Blocks
+from hull.loops import mesh_loops
 
 # Voxels a brick's side is 2**BRICK_LEVEL.
 BRICK_LEVEL = 3
@@ -51,6 +52,33 @@ def binary_surface(blocks: Blocks) -> GridSurface:
     number = np.full(np.array(rows.shape) + 1, -1, dtype=np.int32)
     number[tuple(places)] = np.arange(places.shape[1], dtype=np.int32)
     padded = _with_neighbours(rows, voxels, places)
+    neighbours = np.stack([number[tuple(places + offset[:, None])] for offset in _OFFSETS], axis=1)
+    loops = mesh_loops()
+    if loops is None:
+        inner, outer, faces = surface_plainly(padded, places, neighbours, *_cases())
+        return GridSurface(inner.T, outer.T, faces)
+    n_faces, edges = _cases()
+    first = np.empty(len(padded), dtype=np.int64)
+    within = np.empty((len(padded), 3, _SIDE, _SIDE, _SIDE), dtype=np.int16)
+    cases = np.empty((len(padded), _SIDE, _SIDE, _SIDE), dtype=np.uint8)
+    n_all, n_all_faces = loops.number_vertices(padded, n_faces, first, within, cases)
+    inner, outer = np.empty((3, n_all), dtype=np.int64), np.empty((3, n_all), dtype=np.int64)
+    faces = np.empty((n_all_faces, 3), dtype=np.int64)
+    loops.brick_surface(
+        padded, places, neighbours, n_faces, edges, first, within, cases, inner, outer, faces
+    )
+    return GridSurface(inner.T, outer.T, faces)
+
+
+def surface_plainly(
+    padded: Bool[np.ndarray, "m s1 s1 s1"],
+    places: Int[np.ndarray, "3 m"],
+    neighbours: Int[np.ndarray, "m 8"],
+    n_faces: Int[np.ndarray, "256"],
+    case_edges: UInt8[np.ndarray, "256 most 3"],
+) -> tuple[Int[np.ndarray, "3 v"], Int[np.ndarray, "3 v"], Int[np.ndarray, "f 3"]]:
+    """Inner and outer voxels of the vertices (3 V), and the faces. `neighbours`: the bricks that begin at
+    each corner of a brick."""
     low = padded[:, :-1, :-1, :-1]
 
     # Vertices: which neighbours along each axis differ, numbered brick by brick.
@@ -76,7 +104,6 @@ def binary_surface(blocks: Blocks) -> GridSurface:
     for bit, (x, y, z) in enumerate(_OFFSETS):
         corner = padded[:, x : x + _SIDE, y : y + _SIDE, z : z + _SIDE]
         case |= corner.view(np.uint8) << np.uint8(bit)
-    n_faces, case_edges = _cases()
     cubes = np.flatnonzero(n_faces.take(case.reshape(-1)))
     of_cube = case.reshape(-1).take(cubes)
     count = n_faces.take(of_cube)
@@ -86,13 +113,12 @@ def binary_surface(blocks: Blocks) -> GridSurface:
     edges = case_edges[of_cube.take(repeated), nth]
     in_brick, cube = cubes >> (3 * BRICK_LEVEL), cubes & (_N_VOXELS - 1)
     place = _PLACE_OF_VOXEL.take(cube).take(repeated)[:, None] + _EDGE_PLACE.take(edges)
-    neighbours = np.stack([number[tuple(places + offset[:, None])] for offset in _OFFSETS], axis=1)
     owner = neighbours.reshape(-1).take((8 * in_brick).take(repeated)[:, None] + _CARRY.take(place))
     name = owner * np.intp(3 * _N_VOXELS)
     name += _EDGE_AXIS.take(edges) * _N_VOXELS
     name += _WRAPPED.take(place)
     faces = n_before.take(owner) + within.take(name)
-    return GridSurface(inner.T, outer.T, faces)
+    return inner, outer, faces
 
 
 def _bricks(blocks: Blocks) -> tuple[Int[np.ndarray, "x y z"], Bool[np.ndarray, "n s s s"]]:

@@ -15,12 +15,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from hull.culling import Culling
+from hull.loops import mesh_loops
 from hull.surface import AT_ONCE, Crossings, by_table, exits
 from hull.tables import OUTSIDE, SilhouetteTable
 
 # In voxels: edges whose middle is deeper than the first are split; nothing is moved further than the second.
 _DEPTH_SPLIT = 0.08
 _FARTHEST = 0.5
+# The normals at an edge's ends must add up to more than this.
+_LEAST_LENGTH = 0.5
 
 
 def raise_ridges(
@@ -34,33 +37,27 @@ def raise_ridges(
 ) -> tuple[Crossings, Int[np.ndarray, "f2 3"]]:
     """Vertices (the given ones first) and faces with the deep edges split. `normals`: outward, unit."""
     vertices, cut_by = crossings.vertices, crossings.cut_by
-    start, end = faces.T.ravel(), faces[:, [1, 2, 0]].T.ravel()
-    # On a closed surface every edge runs once in each direction: the rising ones name each edge once.
-    a, b = start[start < end], end[start < end]
-    columns, outward = np.ascontiguousarray(vertices.T), np.ascontiguousarray(normals.T)
-    way = outward.take(a, axis=1) + outward.take(b, axis=1)
-    length = np.sqrt((way**2).sum(axis=0))
-    way *= voxel_m / np.maximum(length, 1e-30)
-    middle = 0.5 * (columns.take(a, axis=1) + columns.take(b, axis=1))
-    places = middle + _DEPTH_SPLIT * way
-    deep = np.flatnonzero(length > 0.5)
-    ends_cut_by = cut_by.take(a), cut_by.take(b)
-    deep = np.concatenate(
-        [
-            _still_inside(tables, places, deep[start : start + AT_ONCE], *ends_cut_by, culling, votes)
-            for start in range(0, max(len(deep), 1), AT_ONCE)
-        ]
-    )
-    middle, way = middle.take(deep, axis=1), _FARTHEST * way.take(deep, axis=1)
+    loops = mesh_loops()
+    middles = edge_middles_plainly if loops is None else _edge_middles_compiled
+    found = []
+    for first in range(0, max(len(faces), 1), AT_ONCE):
+        some = faces[first : first + AT_ONCE]
+        *edges, places = middles(vertices, normals, some, voxel_m, _DEPTH_SPLIT, _LEAST_LENGTH)
+        ends_cut_by = cut_by.take(edges[0]), cut_by.take(edges[1])
+        deep = _still_inside(tables, places, *ends_cut_by, culling, votes)
+        found.append([each.take(deep, axis=-1) for each in edges])
+    a, b, middle, way = (np.concatenate(each, axis=-1) for each in zip(*found, strict=True))
+    way *= _FARTHEST
     exit_at, new_cut_by = exits(tables, middle, way, culling, votes)
     ends = new_cut_by >= 0
-    deep = deep[ends]
+    a, b = a[ends], b[ends]
     new = (middle + way * exit_at)[:, ends].T
+    start, end = faces.T.ravel(), faces[:, [1, 2, 0]].T.ravel()
     # Both faces at an edge look its new vertex up by the edge's name.
-    order = np.argsort(a[deep] * len(vertices) + b[deep])
-    names = (a[deep] * len(vertices) + b[deep])[order]
+    order = np.argsort(a * len(vertices) + b)
+    names = (a * len(vertices) + b)[order]
     touched = np.zeros(len(vertices), dtype=bool)
-    touched[a[deep]] = touched[b[deep]] = True
+    touched[a] = touched[b] = True
     sought = np.flatnonzero(touched[start] & touched[end])
     wanted = np.minimum(start[sought], end[sought]) * len(vertices) + np.maximum(start[sought], end[sought])
     place = np.minimum(np.searchsorted(names, wanted), max(len(names) - 1, 0))
@@ -73,19 +70,76 @@ def raise_ridges(
     )
 
 
+def _edge_middles_compiled(
+    vertices: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    *numbers: float,
+) -> tuple[np.ndarray, ...]:
+    loops, room = mesh_loops(), 3 * len(faces)
+    assert loops is not None
+    edges = [np.empty(room, dtype=np.int64) for _ in range(2)] + [np.empty((3, room)) for _ in range(3)]
+    n = loops.edge_middles(vertices, normals, faces, *numbers, *edges)
+    return tuple(np.ascontiguousarray(each[..., :n]) for each in edges)
+
+
+def edge_middles_plainly(
+    vertices: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    voxel_m: float,
+    depth: float,
+    least_length: float,
+) -> tuple[
+    Int[np.ndarray, " n"],
+    Int[np.ndarray, " n"],
+    Float[np.ndarray, "3 n"],
+    Float[np.ndarray, "3 n"],
+    Float[np.ndarray, "3 n"],
+]:
+    """The ends a < b of each edge where the surface does not fold back (the sum of their normals is so long);
+    its middle, the way outward (a voxel long), and the place that far outside (`depth`, in voxels)."""
+    start, end = faces.T.ravel(), faces[:, [1, 2, 0]].T.ravel()
+    # On a closed surface every edge runs once in each direction: the rising ones name each edge once.
+    a, b = start[start < end], end[start < end]
+    columns, outward = np.ascontiguousarray(vertices.T), np.ascontiguousarray(normals.T)
+    way = outward.take(a, axis=1) + outward.take(b, axis=1)
+    length = np.sqrt((way**2).sum(axis=0))
+    flat = np.flatnonzero(length > least_length)
+    a, b = a.take(flat), b.take(flat)
+    way = way.take(flat, axis=1) * (voxel_m / np.maximum(length.take(flat), 1e-30))
+    middle = 0.5 * (columns.take(a, axis=1) + columns.take(b, axis=1))
+    return a, b, middle, way, middle + depth * way
+
+
 def _still_inside(
     tables: Sequence[SilhouetteTable],
     places: Float[np.ndarray, "3 n"],
-    chosen: Int[np.ndarray, " m"],
     cut_by_1: Int[np.ndarray, " n"],
     cut_by_2: Int[np.ndarray, " n"],
     culling: Culling | None,
     votes: int,
 ) -> Int[np.ndarray, " k"]:
-    """Which (K,) of the places (3 N) chosen (M,) fewer than `votes` cameras see outside.
+    """Which (K,) of the places (3 N) fewer than `votes` cameras see outside.
 
     The cameras that cut an edge's ends refuse almost all of its middle, so one alone is asked first.
     """
+    if culling is not None and culling.stack is not None:
+        blocks, stack = culling.blocks_of(places), culling.stack
+        refused = np.zeros(len(blocks), dtype=bool)
+        stack.loops.refused(
+            stack.numbers,
+            stack.projections,
+            places,
+            cut_by_1,
+            cut_by_2,
+            blocks,
+            culling.refusing_sets,
+            votes,
+            refused,
+        )
+        return np.flatnonzero(~refused)
+    chosen = np.arange(places.shape[1])
     for cut_by in (cut_by_1, cut_by_2) if votes == 1 else ():
         still = np.ones(len(chosen), dtype=bool)
         for table_idx, asked in by_table(cut_by.take(chosen), len(tables)):

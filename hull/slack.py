@@ -14,10 +14,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from hull.culling import Culling
+from hull.loops import mesh_loops
 from hull.rays import RayScene
+from hull.stack import TableStack
 from hull.tables import NO_EVIDENCE, SilhouetteTable
 
 # A ray along the surface itself would hit or miss it by rounding, so it is cast this far inside (pixels).
@@ -48,7 +50,9 @@ class Outlines:
 def outlines_at(points: Float[np.ndarray, "n 3"], culling: Culling) -> Outlines:
     """Ask every camera about every point (world metres, within the culling's grid)."""
     columns = np.ascontiguousarray(points.T)
-    blocks = culling.blocks_of(columns)
+    blocks, stack = culling.blocks_of(columns), culling.stack
+    if stack is not None:
+        return _outlines_compiled(stack, columns, blocks, np.ascontiguousarray(culling.answers.T))
     n_witnesses = np.zeros(len(points), dtype=np.int64)
     point_idx, table_idx = [], []
     for k, table in enumerate(culling.tables):
@@ -59,8 +63,28 @@ def outlines_at(points: Float[np.ndarray, "n 3"], culling: Culling) -> Outlines:
         on_it = near.take(table.on_outline(columns.take(near, axis=1)))
         point_idx.append(on_it)
         table_idx.append(np.full(len(on_it), k))
-    found = np.concatenate(point_idx)
-    return Outlines(n_witnesses, np.bincount(found, minlength=len(points)), found, np.concatenate(table_idx))
+    at = np.concatenate(point_idx)
+    return Outlines(n_witnesses, np.bincount(at, minlength=len(points)), at, np.concatenate(table_idx))
+
+
+def _outlines_compiled(
+    stack: TableStack,
+    columns: Float[np.ndarray, "3 n"],
+    blocks: Int[np.ndarray, " n"],
+    answers: UInt8[np.ndarray, "b c"],
+) -> Outlines:
+    n = len(blocks)
+    n_witnesses, n_bounding = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+    room = 2 * n + len(stack.tables)
+    pairs, first = [], 0
+    while first < n or not pairs:
+        pair = np.empty((2, room), dtype=np.int64)
+        n_found, first = stack.loops.outlines(
+            stack.numbers, stack.projections, columns, blocks, answers, first, n_witnesses, n_bounding, *pair
+        )
+        pairs.append(pair[:, :n_found])
+    point_idx, table_idx = np.concatenate(pairs, axis=1)
+    return Outlines(n_witnesses, n_bounding, point_idx, table_idx)
 
 
 def slack_at(
@@ -97,6 +121,18 @@ def spread_to_neighbours(
     values: Float[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"], n_rounds: int = 50
 ) -> Float[np.ndarray, " v"]:
     """(V,) with each NaN replaced by the mean of its neighbours, round by round; what nothing reaches: 0."""
+    loops = mesh_loops()
+    if loops is None:
+        return spread_plainly(values, faces, n_rounds)
+    values = values.copy()
+    loops.spread_to_neighbours(values, faces, n_rounds)
+    return np.nan_to_num(values, nan=0.0)
+
+
+def spread_plainly(
+    values: Float[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"], n_rounds: int
+) -> Float[np.ndarray, " v"]:
+    """`spread_to_neighbours`, not compiled."""
     values = values.copy()
     rows = faces
     for _ in range(n_rounds):

@@ -20,9 +20,8 @@ from hull.tables import OUTSIDE, SilhouetteTable
 
 # An end that rounding puts on the outline's other side counts as just on its own.
 _BELOW_HALF = float(np.nextafter(0.5, 0.0))
-# The way is halved until this many pixels are left of it; a very long one stays that much coarser.
-_BRACKET_PX = 1.0
-_MOST_HALVED = 128.0
+# The way is halved until a pixel is left of it; one of more than 128 stays that much coarser.
+_MOST_HALVINGS = 7
 # Then to a hundredth of a pixel, nearly always to far less.
 _N_FALSE_POSITIONS = 3
 # More places are asked in parts: what is looked at together should fit into the processor's cache.
@@ -88,6 +87,12 @@ def exits(
         return _exits_by_votes(tables, origin, along, culling, votes)
     # `take` gathers columns five times as fast as an index does, if each row lies in one piece.
     origin, along = np.ascontiguousarray(origin), np.ascontiguousarray(along)
+    if culling is not None and culling.stack is not None:
+        blocks, stack = culling.blocks_of(origin + 0.5 * along), culling.stack
+        exit_at, cut_by = np.empty(len(blocks)), np.empty(len(blocks), dtype=np.int16)
+        numbers, projections, sets = stack.numbers, stack.projections, culling.refusing_sets
+        stack.loops.exits(numbers, projections, origin, along, blocks, sets, exit_at, cut_by)
+        return exit_at, cut_by
     exit_at = np.ones(origin.shape[1])
     place = origin + along
     cut_by = np.full(origin.shape[1], -1, dtype=np.int16)
@@ -174,26 +179,25 @@ def way_out(
     # In the picture the way is a straight line: the search goes along that, and needs no division.
     u, v = base[:2] / base[2]
     du, dv = end[:2] / end[2] - (u, v)
-    length = max(float(np.abs(du).max(initial=0.0)), float(np.abs(dv).max(initial=0.0)))
-    n_halvings = int(np.ceil(np.log2(np.clip(length / _BRACKET_PX, 1.0, _MOST_HALVED))))
+    length = np.maximum(np.abs(du), np.abs(dv))
+    n_halvings = sum((length > 2.0**k).astype(np.int64) for k in range(_MOST_HALVINGS))
     near, near_value = np.zeros(len(outer)), np.maximum(table.ask_pixels(u, v), 0.5)
     far, far_value = np.ones(len(outer)), np.minimum(table.ask_pixels(u + du, v + dv), _BELOW_HALF)
     moved = np.zeros(len(outer), dtype=bool)
-    for step in range(n_halvings + _N_FALSE_POSITIONS):
-        if step < n_halvings:
-            place = 0.5 * (near + far)
-        else:
-            place = near + (far - near) * ((near_value - 0.5) / np.maximum(near_value - far_value, 1e-9))
+    for step in range(int(np.max(n_halvings, initial=0)) + _N_FALSE_POSITIONS):
+        even = near + (far - near) * ((near_value - 0.5) / np.maximum(near_value - far_value, 1e-9))
+        place = np.where(step < n_halvings, 0.5 * (near + far), even)
         value = table.ask_pixels(u + du * place, v + dv * place)
         outside = value < 0.5
-        if step > n_halvings:
-            # The end that stays twice counts half: false position would creep from one side otherwise.
-            again = outside == moved
-            near_value = np.where(again & outside, 0.25 + 0.5 * near_value, near_value)
-            far_value = np.where(again & ~outside, 0.25 + 0.5 * far_value, far_value)
+        # The end that stays twice counts half: false position would creep from one side otherwise.
+        again = (step > n_halvings) & (outside == moved)
         moved = outside
-        far, far_value = np.where(outside, place, far), np.where(outside, value, far_value)
-        near, near_value = np.where(outside, near, place), np.where(outside, near_value, value)
+        going_on = step < n_halvings + _N_FALSE_POSITIONS
+        to_far, to_near = going_on & outside, going_on & ~outside
+        near_value = np.where(again & to_far, 0.25 + 0.5 * near_value, near_value)
+        far_value = np.where(again & to_near, 0.25 + 0.5 * far_value, far_value)
+        far, far_value = np.where(to_far, place, far), np.where(to_far, value, far_value)
+        near, near_value = np.where(to_near, place, near), np.where(to_near, value, near_value)
     place = near + (far - near) * ((near_value - 0.5) / np.maximum(near_value - far_value, 1e-9))
     # Back from the share of the picture's line to the share of the way, which recedes from the camera.
     return outer * place * base[2] / (place * base[2] + (1.0 - place) * end[2])

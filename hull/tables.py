@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -42,6 +43,7 @@ BORDER_PX = 2
 # anyway.
 MAX_LEVEL = 5
 
+FIRST_OUTLINE_BLOCK = 8
 _UNKNOWN_BIT = 16
 
 
@@ -73,6 +75,26 @@ class SilhouetteTable:
     codes: UInt8[np.ndarray, "h w"]
     squares: UInt8[np.ndarray, "levels hb wb"]
 
+    @cached_property
+    def outline_blocks(self) -> tuple[Int[np.ndarray, "hb wb"], UInt8[np.ndarray, "n 16"]]:
+        """The codes again, much smaller: for each block the answer that all its codes give, or, from
+        FIRST_OUTLINE_BLOCK on, the number of its codes, which are stored one block after the other."""
+        classes = self.squares[0]
+        height, width = classes.shape
+        index = classes.astype(np.int32)
+        row, column = np.nonzero(_IS_MIXED.take(classes))
+        index[row, column] = FIRST_OUTLINE_BLOCK + np.arange(len(row), dtype=np.int32)
+        codes = self.codes.reshape(height, BLOCK_PX, width, BLOCK_PX)[row, :, column, :]
+        return index, codes.reshape(len(row), BLOCK_PX**2)
+
+    @cached_property
+    def numbers(self) -> tuple[int, ...]:
+        """What the compiled loops need beside the projection, in the order of `hull.compiled`'s columns."""
+        index, codes = self.outline_blocks
+        assert all(each.flags.c_contiguous for each in (index, codes, self.squares))
+        addresses = (each.__array_interface__["data"][0] for each in (index, codes, self.squares))
+        return (*addresses, *self.squares.shape, *self.lowest, *self.highest, *self.origin)
+
     def ask_points(self, points: Float[np.ndarray, "3 n"]) -> UInt8[np.ndarray, " n"]:
         """INSIDE, OUTSIDE or NO_EVIDENCE for each world point. Points are columns: (3 N), metres."""
         answers, outline, value = self._looked_up(*self._pixels(points))
@@ -93,11 +115,13 @@ class SilhouetteTable:
 
     def projected(self, points: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
         """World points in the picture, not yet divided by their depth."""
-        return self.projection[:, :3] @ points + self.projection[:, 3:]
+        return self.projected_way(points) + self.projection[:, 3:]
 
     def projected_way(self, ways: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
         """World ways (differences of points), likewise."""
-        return self.projection[:, :3] @ ways
+        # Term by term, in the order of `hull.compiled`: a matrix product adds up in an order of its own.
+        x, y, z = ways
+        return np.stack([(row[0] * x + row[1] * y) + row[2] * z for row in self.projection])
 
     def ask_cells(self, centres: Float[np.ndarray, "3 n"], half_m: float) -> UInt8[np.ndarray, " n"]:
         """The answers that can occur in each cube of half side `half_m` around the centres (3 N), metres.
@@ -107,7 +131,7 @@ class SilhouetteTable:
         """
         p = self.projection
         u, v, depth = self.projected(centres)
-        reach_depth = half_m * float(np.abs(p[2, :3]).sum())
+        reach_depth = half_m * float((abs(p[2, 0]) + abs(p[2, 1])) + abs(p[2, 2]))
         all_in_front = bool(len(depth)) and float(depth.min()) > reach_depth
         in_front = depth > reach_depth
         if not all_in_front:
@@ -374,6 +398,8 @@ def _level_of_side() -> np.ndarray:
     return np.maximum(np.ceil(np.log2(np.maximum(sides, 1))).astype(np.int64) - 1, 0)
 
 
+_IS_MIXED = np.ones(UNDECIDED + 1, dtype=bool)
+_IS_MIXED[[INSIDE, OUTSIDE, NO_EVIDENCE]] = False
 _LEVEL_OF_SIDE = _level_of_side()
 _ANSWER_OF_CODE = np.full(32, NO_EVIDENCE, dtype=np.uint8)
 _ANSWER_OF_CODE[:16] = UNDECIDED
