@@ -383,7 +383,8 @@ def _ask_voxels_plainly(
         outside = asked[answers == OUTSIDE]
         n_outside[outside] += 1
         alive[outside[n_outside[outside] >= votes]] = False
-        excepted[camera // WORD_BITS, asked[answers != INSIDE]] |= np.uint64(1) << np.uint64(camera % WORD_BITS)
+        word, bit = camera // WORD_BITS, np.uint64(1) << np.uint64(camera % WORD_BITS)
+        excepted[word, asked[answers != INSIDE]] |= bit
     return excepted
 
 

@@ -1,4 +1,4 @@
-"""The innermost loops of carving, compiled: what `hull.tables` answers, for many places and all cameras at once.
+"""The innermost loops of carving, compiled: what `hull.tables` answers, for many places and all cameras.
 
 The plain definitions (`SilhouetteTable`, `carve`, `exits`, ...) stay as they are and are the reference: every
 kernel does the same operations in the same order, so the answers are the same to the last bit. Compiled, a
@@ -6,7 +6,8 @@ place is taken through all its cameras before the next one is looked at; nothing
 between, and neighbouring places find the little of each picture that they need in the processor's cache.
 
 What a kernel fills is allocated by numpy and handed in: numpy asks the system for large pages, which saves
-most of the cost of fresh memory. Compiled on the first call and kept beside this file, or in the user's cache where that cannot be written.
+most of the cost of fresh memory. Compiled on the first call and kept beside this file, or in the user's cache
+where that cannot be written.
 Everything that is called from here must be in this file: numba looks only at it to see whether what it kept
 is stale.
 """
@@ -38,7 +39,8 @@ _N_FALSE_POSITIONS = 3
     HIGHEST_Y,
     ORIGIN_X,
     ORIGIN_Y,
-) = range(12)
+    N_NUMBERS,
+) = range(13)
 # As in `hull.tables`; a test holds them together.
 INSIDE, OUTSIDE, NO_EVIDENCE, UNDECIDED = 1, 2, 4, 7
 FIRST_OUTLINE_BLOCK = 8
@@ -57,18 +59,22 @@ def _inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     return njit(inline="always", error_model="numpy")(function)
 
 
-def _as_pointer(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+@no_type_check
+def _as_pointer(context, builder, signature, arguments):
     return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
 
 
 @intrinsic
-def _bytes_at(context, address):  # type: ignore[no-untyped-def]
-    """An address as something to index. The tables stay where they are, whichever of them are used together."""
+@no_type_check
+def _bytes_at(context, address):
+    """An address as something to index: tables stay where they are, whichever are used together."""
     return types.CPointer(types.uint8)(types.int64), _as_pointer
 
 
 @intrinsic
-def _numbers_at(context, address):  # type: ignore[no-untyped-def]
+@no_type_check
+def _numbers_at(context, address):
+    """The same of numbers of four bytes."""
     return types.CPointer(types.int32)(types.int64), _as_pointer
 
 
@@ -262,7 +268,7 @@ def ask_children(
                     alive[i] = False
                     break
                 continue
-            if answer == INSIDE or answer == NO_EVIDENCE:
+            if answer in (INSIDE, NO_EVIDENCE):
                 unasked[word, i] &= ~bit
             if not answer & INSIDE:
                 without[word, i] |= bit
@@ -413,23 +419,22 @@ def refused(numbers, projections, places, first, second, block, may_refuse, vote
 
 @_kernel
 @no_type_check
-def outlines(numbers, projections, places, block, answers, first, n_witnesses, n_bounding, point, table):
+def outlines(
+    numbers, projections, places, block, n_seen, unsure, first, n_witnesses, n_bounding, point, table
+):
     """`hull.slack.outlines_at`, from place `first` on as far as `point` and `table` have room: `n_witnesses`
     and `n_bounding` (N,), and the pairs of places and tables that bound them. How many pairs there are, and
-    the place to go on at. `answers` (B C): of each table about each block."""
+    the place to go on at. Of each block: `n_seen` (B,) tables that give evidence on all of it without an
+    outline, `unsure` (B W) the set of those to be asked."""
     n, n_tables = places.shape[1], len(numbers)
     n_found = 0
     for i in range(first, n):
         if n_found + n_tables > len(point):
             return n_found, i
-        seen = bounding = 0
+        seen, bounding = n_seen[block[i]], 0
         x, y, z = places[0, i], places[1, i], places[2, i]
         for k in range(n_tables):
-            known = answers[block[i], k]
-            if known == INSIDE or known == OUTSIDE:
-                seen += 1
-                continue
-            if known == NO_EVIDENCE:
+            if not (unsure[block[i], k >> 6] >> np.uint64(k & 63)) & np.uint64(1):
                 continue
             answer, _ = _ask_point(numbers, projections, k, x, y, z)
             if answer != NO_EVIDENCE:
@@ -440,3 +445,29 @@ def outlines(numbers, projections, places, block, answers, first, n_witnesses, n
                 n_found += 1
         n_witnesses[i], n_bounding[i] = seen, bounding
     return n_found, n
+
+
+@_kernel
+@no_type_check
+def picture_box(image):
+    """(x, y, width, height) of the pixels that are not 0, as `cv2.boundingRect` has it; all 0 without any."""
+    height, width = image.shape
+    top, bottom, left, right = height, -1, width, -1
+    for y in range(height):
+        any_bits = np.uint8(0)
+        for x in range(width):
+            any_bits |= image[y, x]
+        if any_bits == 0:
+            continue
+        top, bottom = min(top, y), y
+        for x in range(left):
+            if image[y, x]:
+                left = x
+                break
+        for x in range(width - 1, right, -1):
+            if image[y, x]:
+                right = x
+                break
+    if bottom < 0:
+        return 0, 0, 0, 0
+    return left, top, right + 1 - left, bottom + 1 - top

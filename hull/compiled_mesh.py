@@ -128,10 +128,9 @@ def spread_to_neighbours(values, faces, n_rounds):
         for r in range(n_rows):
             for k in range(3):
                 i = faces[rows[r], k]
-                if weights[i] > 0:
-                    if np.isnan(values[i]):
-                        values[i] = sums[i] / weights[i]
-                        reached = True
+                if weights[i] > 0 and np.isnan(values[i]):
+                    values[i] = sums[i] / weights[i]
+                    reached = True
                 sums[i], weights[i] = 0.0, 0
         if not reached:
             return
@@ -240,10 +239,10 @@ def brick_surface(
                         for k in range(3):
                             # An edge's number is its axis times 8 plus its lower corner.
                             edge = edges_of[case, nth, k]
-                            i, j, l = x + ((edge >> 2) & 1), y + ((edge >> 1) & 1), z + (edge & 1)
-                            owner = neighbours[m, (i // side) * 4 + (j // side) * 2 + l // side]
+                            i, j, h = x + ((edge >> 2) & 1), y + ((edge >> 1) & 1), z + (edge & 1)
+                            owner = neighbours[m, (i // side) * 4 + (j // side) * 2 + h // side]
                             faces[f, k] = (
-                                first[owner] + within[owner, edge >> 3, i % side, j % side, l % side]
+                                first[owner] + within[owner, edge >> 3, i % side, j % side, h % side]
                             )
                         f += 1
 

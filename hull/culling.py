@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8, UInt64
+from jaxtyping import Bool, Float, Int, UInt64
 
 from hull.carve import Grid
 from hull.stack import stacked
@@ -79,10 +79,12 @@ class Culling:
         mixed = INSIDE | OUTSIDE
         return np.flatnonzero((self._answers[table_idx] & mixed == mixed).take(blocks))
 
-    @property
-    def answers(self) -> UInt8[np.ndarray, "c b"]:
-        """What every table answers about every block asked so far."""
-        return self._answers
+    def outlined_sets(self) -> tuple[Int[np.ndarray, " b"], UInt64[np.ndarray, "b w"]]:
+        """For each block asked so far: how many tables see all of it inside or all of it outside, and the set
+        of those whose answer differs from place to place."""
+        decided = (self._answers == INSIDE) | (self._answers == OUTSIDE)
+        unsure = ~decided & (self._answers != NO_EVIDENCE)
+        return np.count_nonzero(decided, axis=0), _sets_of(unsure)
 
     @property
     def refusing_sets(self) -> UInt64[np.ndarray, "b w"]:
@@ -101,7 +103,11 @@ class Culling:
             answers = np.stack([table.ask_cells(centres, self._half_m) for table in self.tables])
         self._answers = np.concatenate([self._answers, answers], axis=1)
         self._may_refuse = self._answers & OUTSIDE != 0
-        flags = np.zeros((len(names), self._refusing_sets.shape[1] * WORD_BITS), dtype=bool)
-        flags[:, : len(self.tables)] = (answers & OUTSIDE != 0).T
-        sets = np.packbits(flags, axis=1, bitorder="little").view("<u8").astype(np.uint64, copy=False)
-        self._refusing_sets = np.concatenate([self._refusing_sets, sets])
+        self._refusing_sets = np.concatenate([self._refusing_sets, _sets_of(answers & OUTSIDE != 0)])
+
+
+def _sets_of(flags: Bool[np.ndarray, "c n"]) -> UInt64[np.ndarray, "n w"]:
+    """Sets of tables as bits, a row of words for each column of flags."""
+    padded = np.zeros((flags.shape[1], -(-len(flags) // WORD_BITS) * WORD_BITS), dtype=bool)
+    padded[:, : len(flags)] = flags.T
+    return np.packbits(padded, axis=1, bitorder="little").view("<u8").astype(np.uint64, copy=False)

@@ -64,9 +64,7 @@ def binary_surface(blocks: Blocks) -> GridSurface:
     n_all, n_all_faces = loops.number_vertices(padded, n_faces, first, within, cases)
     inner, outer = np.empty((3, n_all), dtype=np.int64), np.empty((3, n_all), dtype=np.int64)
     faces = np.empty((n_all_faces, 3), dtype=np.int64)
-    loops.brick_surface(
-        padded, places, neighbours, n_faces, edges, first, within, cases, inner, outer, faces
-    )
+    loops.brick_surface(padded, places, neighbours, n_faces, edges, first, within, cases, inner, outer, faces)
     return GridSurface(inner.T, outer.T, faces)
 
 

@@ -39,14 +39,14 @@ def raise_ridges(
     vertices, cut_by = crossings.vertices, crossings.cut_by
     loops = mesh_loops()
     middles = edge_middles_plainly if loops is None else _edge_middles_compiled
-    found = []
+    parts = []
     for first in range(0, max(len(faces), 1), AT_ONCE):
         some = faces[first : first + AT_ONCE]
         *edges, places = middles(vertices, normals, some, voxel_m, _DEPTH_SPLIT, _LEAST_LENGTH)
         ends_cut_by = cut_by.take(edges[0]), cut_by.take(edges[1])
         deep = _still_inside(tables, places, *ends_cut_by, culling, votes)
-        found.append([each.take(deep, axis=-1) for each in edges])
-    a, b, middle, way = (np.concatenate(each, axis=-1) for each in zip(*found, strict=True))
+        parts.append([each.take(deep, axis=-1) for each in edges])
+    a, b, middle, way = (np.concatenate(each, axis=-1) for each in zip(*parts, strict=True))
     way *= _FARTHEST
     exit_at, new_cut_by = exits(tables, middle, way, culling, votes)
     ends = new_cut_by >= 0
@@ -125,15 +125,15 @@ def _still_inside(
     The cameras that cut an edge's ends refuse almost all of its middle, so one alone is asked first.
     """
     if culling is not None and culling.stack is not None:
-        blocks, stack = culling.blocks_of(places), culling.stack
-        refused = np.zeros(len(blocks), dtype=bool)
+        stack, named = culling.stack, culling.blocks_of(places)
+        refused = np.zeros(len(named), dtype=bool)
         stack.loops.refused(
             stack.numbers,
             stack.projections,
             places,
             cut_by_1,
             cut_by_2,
-            blocks,
+            named,
             culling.refusing_sets,
             votes,
             refused,

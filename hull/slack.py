@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int, UInt64
 
 from hull.culling import Culling
 from hull.loops import mesh_loops
@@ -27,7 +27,7 @@ from hull.tables import NO_EVIDENCE, SilhouetteTable
 _NUDGE_PX = 0.5
 # Slack is measured at no more vertices than this and spread to their neighbours: it changes slowly, and finer
 # grids should not cost more rays.
-MAX_MEASURED = 24_000
+MAX_MEASURED = 12_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ def outlines_at(points: Float[np.ndarray, "n 3"], culling: Culling) -> Outlines:
     columns = np.ascontiguousarray(points.T)
     blocks, stack = culling.blocks_of(columns), culling.stack
     if stack is not None:
-        return _outlines_compiled(stack, columns, blocks, np.ascontiguousarray(culling.answers.T))
+        return _outlines_compiled(stack, columns, blocks, *culling.outlined_sets())
     n_witnesses = np.zeros(len(points), dtype=np.int64)
     point_idx, table_idx = [], []
     for k, table in enumerate(culling.tables):
@@ -71,16 +71,27 @@ def _outlines_compiled(
     stack: TableStack,
     columns: Float[np.ndarray, "3 n"],
     blocks: Int[np.ndarray, " n"],
-    answers: UInt8[np.ndarray, "b c"],
+    n_seen: Int[np.ndarray, " b"],
+    unsure: UInt64[np.ndarray, "b w"],
 ) -> Outlines:
     n = len(blocks)
     n_witnesses, n_bounding = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
     room = 2 * n + len(stack.tables)
-    pairs, first = [], 0
+    pairs: list[np.ndarray] = []
+    first = 0
     while first < n or not pairs:
         pair = np.empty((2, room), dtype=np.int64)
         n_found, first = stack.loops.outlines(
-            stack.numbers, stack.projections, columns, blocks, answers, first, n_witnesses, n_bounding, *pair
+            stack.numbers,
+            stack.projections,
+            columns,
+            blocks,
+            n_seen,
+            unsure,
+            first,
+            n_witnesses,
+            n_bounding,
+            *pair,
         )
         pairs.append(pair[:, :n_found])
     point_idx, table_idx = np.concatenate(pairs, axis=1)

@@ -88,7 +88,7 @@ def exits(
     # `take` gathers columns five times as fast as an index does, if each row lies in one piece.
     origin, along = np.ascontiguousarray(origin), np.ascontiguousarray(along)
     if culling is not None and culling.stack is not None:
-        blocks, stack = culling.blocks_of(origin + 0.5 * along), culling.stack
+        stack, blocks = culling.stack, culling.blocks_of(origin + 0.5 * along)
         exit_at, cut_by = np.empty(len(blocks)), np.empty(len(blocks), dtype=np.int16)
         numbers, projections, sets = stack.numbers, stack.projections, culling.refusing_sets
         stack.loops.exits(numbers, projections, origin, along, blocks, sets, exit_at, cut_by)
@@ -96,12 +96,12 @@ def exits(
     exit_at = np.ones(origin.shape[1])
     place = origin + along
     cut_by = np.full(origin.shape[1], -1, dtype=np.int16)
-    blocks = None if culling is None else culling.blocks_of(origin + 0.5 * along)
+    near = None if culling is None else culling.blocks_of(origin + 0.5 * along)
     for table_idx, table in enumerate(tables):
-        if culling is None or blocks is None:
+        if culling is None or near is None:
             asked = np.arange(origin.shape[1])
         else:
-            asked = culling.may_refuse(table_idx, blocks)
+            asked = culling.may_refuse(table_idx, near)
         answers = table.ask_points(place.take(asked, axis=1))
         refused = asked.take(np.flatnonzero(answers == OUTSIDE))
         if not len(refused):

@@ -21,7 +21,7 @@ MAY_IMPORT = {
 COMMON = {"numpy", "scipy", "jaxtyping", "tqdm"}
 LIBRARIES = {
     "capture": {"cv2", "pycolmap"},
-    "hull": {"cv2", "skimage", "open3d"},
+    "hull": {"cv2", "skimage", "open3d", "numba"},
     "fit": {"jax", "skimage", "open3d", "threadpoolctl", "platformdirs", "body_models"},
     "render": {"cv2", "open3d", "pyrender", "OpenGL", "av", "jinja2", "matplotlib"},
     "bodyhull": {"tyro", "jax", "av"},
