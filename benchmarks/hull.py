@@ -4,9 +4,9 @@
     python -m benchmarks.hull --quick    # 16 cameras of 1 MP in a cube of 256^3 voxels, open3d beside it
 
 Every row runs in a process of its own, on one thread, and reports its processor time (the least of the
-repetitions) and how much its memory rose above what the silhouettes take. The subject is a figure of
-capsules, 1.75 m tall, in a cube of 2 m. What other programs do on the machine makes every row slower, and
-large rows more than small ones.
+repetitions) and how much its memory rose above what the silhouettes and the loaded libraries take. The
+subject is a figure of capsules, 1.75 m tall, in a cube of 2 m. What other programs do on the machine makes
+every row slower, and large rows more than small ones.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import argparse
 import multiprocessing
 import os
 import platform
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -34,6 +35,7 @@ from hull.carve import Grid, carve
 from hull.cleaning import is_closed, keep_what_matters, vertex_normals
 from hull.culling import Culling
 from hull.diagnosis import inside_by_definition
+from hull.loops import mesh_loops, table_loops
 from hull.marching import binary_surface
 from hull.quality import silhouette_agreement
 from hull.rays import RayScene
@@ -208,6 +210,34 @@ def row_surface(case: Case, seconds: list[float]) -> str:
     return f"{len(vertices)} vertices"
 
 
+def row_plain(case: Case, seconds: list[float]) -> str:
+    """Without numba: the plain definitions, which the compiled loops repeat."""
+    sys.modules["numba"] = None  # type: ignore[assignment]  # that is how an import is made to fail
+    assert table_loops() is None and mesh_loops() is None
+    return row_faults(case, seconds)
+
+
+def row_first_call(case: Case, seconds: list[float]) -> str:
+    """Compiling, and loading what was compiled: both beside the time that a hull takes."""
+    with tempfile.TemporaryDirectory() as name:
+        os.environ["NUMBA_CACHE_DIR"] = name
+        with timed(seconds):
+            _small_hull()
+        size = sum(path.stat().st_size for path in Path(name).rglob("*"))
+        return f"compiled anew, once after every installation; {size / 1e6:.1f} MB kept"
+
+
+def row_loading(case: Case, seconds: list[float]) -> str:
+    with timed(seconds):
+        _small_hull()
+    return "numba and the compiled loops loaded, open3d too: once a process"
+
+
+def _small_hull() -> None:
+    rig = dome_layout(4, (96, 96))
+    build_hull(rig, silhouettes(rig), 0.05)
+
+
 def row_faults(case: Case, seconds: list[float]) -> str:
     for _ in range(case.repetitions):
         with timed(seconds):
@@ -232,14 +262,20 @@ def row_agreement(case: Case, seconds: list[float]) -> str:
 
 
 def row_read(case: Case, seconds: list[float]) -> str:
-    return _from_files(case, seconds, with_hull=False)
+    return _from_files(case, seconds, lambda _rig, _images: None)
 
 
 def row_from_files(case: Case, seconds: list[float]) -> str:
-    return _from_files(case, seconds, with_hull=True)
+    return _from_files(
+        case, seconds, lambda rig, images: refined_mesh(prepare_tables(rig, images), case.voxel_m)
+    )
 
 
-def _from_files(case: Case, seconds: list[float], with_hull: bool) -> str:
+def row_all_from_files(case: Case, seconds: list[float]) -> str:
+    return _from_files(case, seconds, lambda rig, images: build_hull(rig, images, case.voxel_m))
+
+
+def _from_files(case: Case, seconds: list[float], then: Callable[[Rig, Sequence], object]) -> str:
     with tempfile.TemporaryDirectory() as name:
         root, size = Path(name), 0
         case.rig.save(root / "rig.json")
@@ -253,8 +289,7 @@ def _from_files(case: Case, seconds: list[float], with_hull: bool) -> str:
         for _ in range(case.repetitions):
             with timed(seconds):
                 silhouettes = recording.silhouettes(0)
-                if with_hull:
-                    refined_mesh(prepare_tables(recording.rig, silhouettes.images), case.voxel_m)
+                then(recording.rig, silhouettes.images)
     assert not silhouettes.problems
     return f"{size / len(case.rig.cameras) / 1000:.0f} kB a file, 8 bits"
 
@@ -298,6 +333,9 @@ def _measure(row: Row, settings: Settings, queue: Queue[tuple[float, float, str]
     cv2.setNumThreads(1)
     case = Case(settings)
     seconds: list[float] = []
+    if row not in (row_plain, row_first_call, row_loading):
+        # What is loaded once a process has rows of its own.
+        _small_hull()
     before = _reset_peak_mb()
     remark = row(case, seconds)
     queue.put((min(seconds), status_mb("VmHWM") - before, remark))
@@ -380,14 +418,18 @@ def beside_open3d(folder: Path) -> None:
 
 def phases(settings: Settings) -> None:
     """One frame, from masks and from files."""
+    measured("once: compiling", row_first_call, settings)
+    measured("once a process: loading", row_loading, settings)
     measured("tables", row_tables, settings)
     measured("bounds, all of space searched", row_bounds, settings)
     measured("bounds, near the last frame's", row_bounds_near, settings)
     mesh, _ = measured("masks to refined mesh", row_mesh, settings)
     facts, _ = measured("the same with the vertices' facts", row_facts, settings)
     faults, _ = measured("build_hull: the same with the search for faults", row_faults, settings)
+    measured("the same without numba", row_plain, settings)
     measured("reading the PNG files", row_read, settings)
     measured("PNG files to refined mesh", row_from_files, settings)
+    measured("PNG files to all of build_hull", row_all_from_files, settings)
     measured("agreement with the silhouettes", row_agreement, settings)
     print(f"\nmesh {mesh:.2f} s, facts {facts - mesh:+.2f} s, faults {faults - facts:+.2f} s", flush=True)
 

@@ -27,7 +27,7 @@ from hull.tables import NO_EVIDENCE, SilhouetteTable
 _NUDGE_PX = 0.5
 # Slack is measured at no more vertices than this and spread to their neighbours: it changes slowly, and finer
 # grids should not cost more rays.
-MAX_MEASURED = 12_000
+MAX_MEASURED = 24_000
 
 
 @dataclass(frozen=True, eq=False)
