@@ -64,3 +64,21 @@ def figure() -> Balls:
         rows += limb((0.1 * side, 0, 0.9), (0.18 * side, 0.05, 0.08), 0.09, 0.05, 16)
     table = np.array(rows)
     return Balls(table[:, :3], table[:, 3])
+
+
+def is_vertex_manifold(faces: np.ndarray, n_vertices: int) -> bool:
+    """True if the faces around each vertex of a closed surface form one fan: no two cones share a tip."""
+    # Around a corner, each face leads from one edge to the next; as many turns as fans.
+    corner, leaving = faces.ravel(), faces[:, [1, 2, 0]].ravel()
+    arriving = faces[:, [2, 0, 1]].ravel()
+    forth = {(a, b): c for a, b, c in zip(corner.tolist(), leaving.tolist(), arriving.tolist(), strict=True)}
+    degree = np.bincount(corner, minlength=n_vertices)
+    first: dict[int, int] = dict(zip(corner.tolist(), leaving.tolist(), strict=True))
+    for vertex, start in first.items():
+        n, at = 1, forth[vertex, start]
+        while at != start:
+            at = forth[vertex, at]
+            n += 1
+        if n != degree[vertex]:
+            return False
+    return True
