@@ -359,17 +359,16 @@ def _way_out(numbers, k, base_u, base_v, base_depth, end_u, end_v, end_depth, ou
 
 @_kernel
 @no_type_check
-def exits(numbers, projections, origin, along, block, may_refuse, exit_at, cut_by):
-    """`hull.surface.exits` with one vote: `exit_at`, `cut_by` (N,). `block` (N,): row of `may_refuse` (B W),
-    sets of tables."""
+def exits(numbers, projections, origin, along, block, ends, who, exit_at, cut_by):
+    """`hull.surface.exits` with one vote: `exit_at`, `cut_by` (N,). The tables that may
+    refuse `block` (N,) b are `who` from `ends[b]` to `ends[b + 1]`."""
     for i in range(origin.shape[1]):
         x_0, y_0, z_0 = origin[0, i], origin[1, i], origin[2, i]
         dx, dy, dz = along[0, i], along[1, i], along[2, i]
         x, y, z = x_0 + dx, y_0 + dy, z_0 + dz
         share, last = 1.0, -1
-        for k in range(len(numbers)):
-            if not (may_refuse[block[i], k >> 6] >> np.uint64(k & 63)) & np.uint64(1):
-                continue
+        for j in range(ends[block[i]], ends[block[i] + 1]):
+            k = who[j]
             if not _refuses(numbers, projections, k, x, y, z):
                 continue
             base_u, base_v, base_depth = _projected(projections, k, x_0, y_0, z_0)
@@ -394,7 +393,7 @@ def exits(numbers, projections, origin, along, block, may_refuse, exit_at, cut_b
 
 @_kernel
 @no_type_check
-def refused(numbers, projections, places, first, second, block, may_refuse, votes, result):
+def refused(numbers, projections, places, first, second, block, ends, who, votes, result):
     """`result` (N, all false): whether at least `votes` tables see a place outside. `first`, `second` (N,):
     tables (or -1) that are asked before the others, where one vote is enough."""
     for i in range(len(result)):
@@ -407,9 +406,8 @@ def refused(numbers, projections, places, first, second, block, may_refuse, vote
                 result[i] = True
                 continue
         left = votes
-        for k in range(len(numbers)):
-            if not (may_refuse[block[i], k >> 6] >> np.uint64(k & 63)) & np.uint64(1):
-                continue
+        for j in range(ends[block[i]], ends[block[i] + 1]):
+            k = who[j]
             if _refuses(numbers, projections, k, x, y, z):
                 left -= 1
                 if left == 0:
@@ -420,12 +418,12 @@ def refused(numbers, projections, places, first, second, block, may_refuse, vote
 @_kernel
 @no_type_check
 def outlines(
-    numbers, projections, places, block, n_seen, unsure, first, n_witnesses, n_bounding, point, table
+    numbers, projections, places, block, n_seen, ends, who, first, n_witnesses, n_bounding, point, table
 ):
     """`hull.slack.outlines_at`, from place `first` on as far as `point` and `table` have room: `n_witnesses`
     and `n_bounding` (N,), and the pairs of places and tables that bound them. How many pairs there are, and
     the place to go on at. Of each block: `n_seen` (B,) tables that give evidence on all of it without an
-    outline, `unsure` (B W) the set of those to be asked."""
+    outline; `ends` (B + 1) and `who`: those to be asked, as in `exits`."""
     n, n_tables = places.shape[1], len(numbers)
     n_found = 0
     for i in range(first, n):
@@ -433,9 +431,8 @@ def outlines(
             return n_found, i
         seen, bounding = n_seen[block[i]], 0
         x, y, z = places[0, i], places[1, i], places[2, i]
-        for k in range(n_tables):
-            if not (unsure[block[i], k >> 6] >> np.uint64(k & 63)) & np.uint64(1):
-                continue
+        for j in range(ends[block[i]], ends[block[i] + 1]):
+            k = who[j]
             answer, _ = _ask_point(numbers, projections, k, x, y, z)
             if answer != NO_EVIDENCE:
                 seen += 1

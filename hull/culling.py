@@ -11,12 +11,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt64
+from jaxtyping import Bool, Float, Int
 
 from hull.carve import Grid
 from hull.stack import stacked
 from hull.tables import INSIDE, NO_EVIDENCE, OUTSIDE, SilhouetteTable
-from hull.witnesses import WORD_BITS
 
 # Voxels a block's side. Smaller blocks spare more questions about points and ask more about blocks.
 BLOCK_VOXELS = 4
@@ -40,7 +39,7 @@ class Culling:
         self._number = np.full(int(np.prod(self._blocks.shape)), -1, dtype=np.int32)
         self._answers = np.zeros((len(self.tables), 0), dtype=np.uint8)
         self._may_refuse = np.zeros((len(self.tables), 0), dtype=bool)
-        self._refusing_sets = np.zeros((0, -(-len(self.tables) // WORD_BITS)), dtype=np.uint64)
+        self._refusing = _lists_of(self._may_refuse)
         self.stack = stacked(self.tables)
 
     def blocks_of(self, places: Float[np.ndarray, "3 n"]) -> Int[np.ndarray, " n"]:
@@ -79,17 +78,20 @@ class Culling:
         mixed = INSIDE | OUTSIDE
         return np.flatnonzero((self._answers[table_idx] & mixed == mixed).take(blocks))
 
-    def outlined_sets(self) -> tuple[Int[np.ndarray, " b"], UInt64[np.ndarray, "b w"]]:
-        """For each block asked so far: how many tables see all of it inside or all of it outside, and the set
-        of those whose answer differs from place to place."""
+    def outlined(
+        self,
+    ) -> tuple[Int[np.ndarray, " b"], tuple[Int[np.ndarray, " b1"], Int[np.ndarray, " n"]]]:
+        """For each block asked so far: how many tables see all of it inside or all of it outside; and those
+        whose answer differs from place to place, listed as in `refusing`."""
         decided = (self._answers == INSIDE) | (self._answers == OUTSIDE)
         unsure = ~decided & (self._answers != NO_EVIDENCE)
-        return np.count_nonzero(decided, axis=0), _sets_of(unsure)
+        return np.count_nonzero(decided, axis=0), _lists_of(unsure)
 
     @property
-    def refusing_sets(self) -> UInt64[np.ndarray, "b w"]:
-        """For each block asked so far the set of tables that may see some of it outside."""
-        return self._refusing_sets
+    def refusing(self) -> tuple[Int[np.ndarray, " b1"], Int[np.ndarray, " n"]]:
+        """The tables that may see some of a block outside, block after block, and where those of each end:
+        those of block b lie from `ends[b]` to `ends[b + 1]`."""
+        return self._refusing
 
     def _ask(self, names: Int[np.ndarray, " n"]) -> None:
         self._number[names] = self._answers.shape[1] + np.arange(len(names), dtype=np.int32)
@@ -103,11 +105,14 @@ class Culling:
             answers = np.stack([table.ask_cells(centres, self._half_m) for table in self.tables])
         self._answers = np.concatenate([self._answers, answers], axis=1)
         self._may_refuse = self._answers & OUTSIDE != 0
-        self._refusing_sets = np.concatenate([self._refusing_sets, _sets_of(answers & OUTSIDE != 0)])
+        ends, who = _lists_of(answers & OUTSIDE != 0)
+        self._refusing = (
+            np.concatenate([self._refusing[0], self._refusing[0][-1] + ends[1:]]),
+            np.concatenate([self._refusing[1], who]),
+        )
 
 
-def _sets_of(flags: Bool[np.ndarray, "c n"]) -> UInt64[np.ndarray, "n w"]:
-    """Sets of tables as bits, a row of words for each column of flags."""
-    padded = np.zeros((flags.shape[1], -(-len(flags) // WORD_BITS) * WORD_BITS), dtype=bool)
-    padded[:, : len(flags)] = flags.T
-    return np.packbits(padded, axis=1, bitorder="little").view("<u8").astype(np.uint64, copy=False)
+def _lists_of(flags: Bool[np.ndarray, "c n"]) -> tuple[Int[np.ndarray, " n1"], Int[np.ndarray, " m"]]:
+    """The rows flagged in each column, column after column, and where those of each column begin and end."""
+    who = np.nonzero(np.ascontiguousarray(flags.T))[1]
+    return np.concatenate([[0], np.cumsum(np.count_nonzero(flags, axis=0))]), who

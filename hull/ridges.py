@@ -134,7 +134,7 @@ def _still_inside(
             cut_by_1,
             cut_by_2,
             named,
-            culling.refusing_sets,
+            *culling.refusing,
             votes,
             refused,
         )

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int, UInt64
+from jaxtyping import Float, Int
 
 from hull.culling import Culling
 from hull.loops import mesh_loops
@@ -52,7 +52,7 @@ def outlines_at(points: Float[np.ndarray, "n 3"], culling: Culling) -> Outlines:
     columns = np.ascontiguousarray(points.T)
     blocks, stack = culling.blocks_of(columns), culling.stack
     if stack is not None:
-        return _outlines_compiled(stack, columns, blocks, *culling.outlined_sets())
+        return _outlines_compiled(stack, columns, blocks, *culling.outlined())
     n_witnesses = np.zeros(len(points), dtype=np.int64)
     point_idx, table_idx = [], []
     for k, table in enumerate(culling.tables):
@@ -72,7 +72,7 @@ def _outlines_compiled(
     columns: Float[np.ndarray, "3 n"],
     blocks: Int[np.ndarray, " n"],
     n_seen: Int[np.ndarray, " b"],
-    unsure: UInt64[np.ndarray, "b w"],
+    unsure: tuple[Int[np.ndarray, " b1"], Int[np.ndarray, " m"]],
 ) -> Outlines:
     n = len(blocks)
     n_witnesses, n_bounding = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
@@ -87,7 +87,7 @@ def _outlines_compiled(
             columns,
             blocks,
             n_seen,
-            unsure,
+            *unsure,
             first,
             n_witnesses,
             n_bounding,

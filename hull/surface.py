@@ -90,8 +90,8 @@ def exits(
     if culling is not None and culling.stack is not None:
         stack, blocks = culling.stack, culling.blocks_of(origin + 0.5 * along)
         exit_at, cut_by = np.empty(len(blocks)), np.empty(len(blocks), dtype=np.int16)
-        numbers, projections, sets = stack.numbers, stack.projections, culling.refusing_sets
-        stack.loops.exits(numbers, projections, origin, along, blocks, sets, exit_at, cut_by)
+        numbers, projections, lists = stack.numbers, stack.projections, culling.refusing
+        stack.loops.exits(numbers, projections, origin, along, blocks, *lists, exit_at, cut_by)
         return exit_at, cut_by
     exit_at = np.ones(origin.shape[1])
     place = origin + along

@@ -207,8 +207,8 @@ def test_a_place_behind_a_camera_is_no_evidence_compiled_either() -> None:
     assert answers[0, 0] == NO_EVIDENCE
     assert answers[0].tolist() == table.ask_cells(places, 0.001).tolist()
     refused = np.zeros(2, dtype=bool)
-    none, all_ = np.full(2, -1, dtype=np.int16), np.ones((1, 1), dtype=np.uint64)
+    none, all_ = np.full(2, -1, dtype=np.int16), (np.array([0, 1]), np.array([0]))
     block = np.zeros(2, dtype=np.int64)
-    stack.loops.refused(stack.numbers, stack.projections, places, none, none, block, all_, 1, refused)
+    stack.loops.refused(stack.numbers, stack.projections, places, none, none, block, *all_, 1, refused)
     assert not refused[0]
     assert refused.tolist() == (table.ask_points(places) == OUTSIDE).tolist()
