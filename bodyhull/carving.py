@@ -23,14 +23,19 @@ from capture.recording import Recording, Silhouettes, open_recording
 from hull.bounds import Bounds
 from hull.colours import vertex_colours
 from hull.errors import HullError
-from hull.faults import CameraFault
+from hull.faults import WRONG_HULL, CameraFault
 from hull.hull_file import facts_file, load_hull, save_hull
+from hull.marks import size_mark
 from hull.mesh_file import MeshFileError
 from hull.quality import silhouette_agreement
 from hull.soft_tables import as_mask
 from hull.visual_hull import HullOptions, build_hull
 
 OFTEN_SHARE = 1 / 3
+# A person's hull does not change its volume by more than this factor within a recording: the first with very
+# many cameras, and what so many times one over their number adds.
+STEADY, LESS_STEADY, COMPARED_FROM = 1.2, 1.6, 5
+COMPARED = "of the median over the frames"
 AGAIN = "run with --overwrite to redo it, or choose another --out"
 NOTED_PACKAGES = (
     "numpy",
@@ -47,7 +52,9 @@ NOTED_PACKAGES = (
 @dataclass(frozen=True)
 class CarvedFrame:
     """What is known of a frame's hull: status "ok", "degraded" (a camera gave no evidence or contradicts the
-    others, there is a second subject, or one that leaves what the cameras see) or "failed"."""
+    others, there is a second subject, or one that leaves what the cameras see), "suspect" (so many contradict
+    one another, or the volume is so far from a person's or from the other frames', that the hull is probably
+    wrong; it is kept) or "failed"."""
 
     frame_id: int
     status: str
@@ -184,6 +191,9 @@ def carve_stage(config: RunConfig) -> Recording:
         folder.update_stage(
             "hull", seconds=round(time.perf_counter() - started, 2), carved=len(todo), frames=frames
         )
+    for frame_id, sentence in compare_volumes(frames, len(recording.rig)):
+        tqdm.write(f"warning: frame {frame_id}: {sentence}", file=sys.stderr)
+    folder.update_stage("hull", frames=frames)
     for sentence in often_at_fault(frames):
         tqdm.write(f"warning: {sentence}", file=sys.stderr)
     failed = [k for k in recording.frame_ids if frames[f"{k:06d}"]["status"] == "failed"]
@@ -203,6 +213,35 @@ def often_at_fault(frames: dict[str, Any]) -> list[str]:
         for name, n in sorted(counts.items())
         if n >= max(2, OFTEN_SHARE * len(carved))
     ]
+
+
+def compare_volumes(frames: dict[str, Any], n_cameras: int) -> list[tuple[str, str]]:
+    """Mark the frames (of run.json, changed in place) whose hull is far larger or smaller than the others'.
+
+    Two people who touch are one subject to the silhouettes, and what a few cameras wrongly take away nobody
+    contradicts; but one person's volume is steady. Returns frames and sentences. Nothing is said of a few
+    frames.
+    """
+    for entry in frames.values():
+        kept = [problem for problem in entry["problems"] if COMPARED not in problem]
+        if len(kept) < len(entry["problems"]):
+            entry["problems"], entry["status"] = kept, entry["status_alone"]
+    volumes = {k: entry["volume_m3"] for k, entry in frames.items() if entry["status"] != "failed"}
+    if len(volumes) < COMPARED_FROM:
+        return []
+    median = float(np.median(list(volumes.values())))
+    limit = STEADY + LESS_STEADY / n_cameras
+    told = []
+    for name in sorted(volumes):
+        factor = volumes[name] / median
+        if not 1 / limit < factor < limit:
+            why = "a second person, or somebody's things?" if factor > 1 else "is a part missing?"
+            sentence = f"the hull holds {1e3 * volumes[name]:.0f} L, {factor:.0%} {COMPARED}: {why}"
+            entry = frames[name]
+            entry["status_alone"] = entry["status"]
+            entry["problems"], entry["status"] = [*entry["problems"], sentence], "suspect"
+            told.append((name, sentence))
+    return told
 
 
 def _carved(folder: RunFolder, frame_id: int, known: dict[str, Any]) -> bool:
@@ -244,7 +283,8 @@ def carve_frame(
         folder.hull(frame_id).unlink(missing_ok=True)
         facts_file(folder.hull(frame_id)).unlink(missing_ok=True)
         return CarvedFrame(frame_id, "failed", (*silhouettes.problems, message)), None
-    for sentence in (*hull.marks, *(fault.sentence() for fault in hull.faults)):
+    of_a_person = size_mark(hull.volume_m3, sum(image is not None for image in silhouettes.images))
+    for sentence in (*of_a_person, *hull.marks, *(fault.sentence() for fault in hull.faults)):
         tqdm.write(f"warning: frame {frame_id:06d}: {sentence}", file=sys.stderr)
     masks = silhouettes.images
     if options.soft:
@@ -262,10 +302,13 @@ def carve_frame(
     path = folder.hull(frame_id)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_hull(path, hull)
-    problems = (*silhouettes.problems, *hull.problems)
+    problems = (*silhouettes.problems, *of_a_person, *hull.problems)
+    status = "degraded" if silhouettes.problems or hull.faults or hull.marks else "ok"
+    if of_a_person or hull.contradiction > WRONG_HULL:
+        status = "suspect"
     carved = CarvedFrame(
         frame_id,
-        "degraded" if silhouettes.problems or hull.faults or hull.marks else "ok",
+        status,
         problems,
         tuple(None if np.isnan(v) else round(float(v), 5) for v in agreement),
         round(hull.volume_m3, 6),

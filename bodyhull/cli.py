@@ -145,7 +145,7 @@ def joined_signs(arguments: Sequence[str]) -> list[str]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the `bodyhull` command; exits with 0, 1 (error), 2 (usage) or 3 (finished, but frames
-    failed)."""
+    failed or are suspect)."""
     words = joined_signs(sys.argv[1:] if arguments is None else arguments)
     command: Command = tyro.cli(
         Command,
@@ -255,16 +255,20 @@ def configuration_of(
 
 
 def frames_code(root: Path, stage: str) -> int:
-    """Exit code after a stage: 3 where frames failed, with a sentence that names them."""
-    frames = RunFolder(root).read_state().get("stages", {}).get(stage, {}).get("frames", {})
-    failed = sorted(k for k, entry in frames.items() if entry["status"] == "failed")
-    if not failed:
-        return OK
-    listed = ", ".join(failed[:8]) + (f" and {len(failed) - 8} more" if len(failed) > 8 else "")
-    print(
-        f"bodyhull: {len(failed)} of {len(frames)} frames failed in stage {stage}: {listed}", file=sys.stderr
-    )
-    return FRAMES_FAILED
+    """Exit code after a stage: 3 where frames failed or hulls are suspect, with sentences that name them."""
+    stages = RunFolder(root).read_state().get("stages", {})
+    code = OK
+    for name, status, told in (
+        ("hull", "suspect", "have a hull that is not to be trusted (see their problems in run.json)"),
+        (stage, "failed", f"failed in stage {stage}"),
+    ):
+        frames = stages.get(name, {}).get("frames", {})
+        those = sorted(k for k, entry in frames.items() if entry["status"] == status)
+        if those:
+            listed = ", ".join(those[:8]) + (f" and {len(those) - 8} more" if len(those) > 8 else "")
+            print(f"bodyhull: {len(those)} of {len(frames)} frames {told}: {listed}", file=sys.stderr)
+            code = FRAMES_FAILED
+    return code
 
 
 def run(config: RunConfig, settings: FitSettings | None = None) -> int:

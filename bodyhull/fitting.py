@@ -56,7 +56,7 @@ def fit_stage(config: RunConfig, settings: FitSettings | None = None) -> None:
             f"{folder.root}: only {len(hulls)} of {len(recording['frame_ids'])} frames are carved; "
             f"finish them first: bodyhull carve RECORDING --out {folder.root}"
         )
-    frame_ids = [k for k in recording["frame_ids"] if hulls[f"{k:06d}"]["status"] in ("ok", "degraded")]
+    frame_ids = [k for k in recording["frame_ids"] if hulls[f"{k:06d}"]["status"] != "failed"]
     if not frame_ids:
         raise UserError(f"{folder.root}: every frame's hull failed, so there is nothing to fit")
 

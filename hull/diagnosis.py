@@ -10,11 +10,16 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from capture.camera import Camera
 from hull.carve import Grid, carve
-from hull.tables import INSIDE, NO_EVIDENCE, OUTSIDE, SilhouetteTable
+from hull.errors import HullError
+from hull.tables import BORDER_PX, INSIDE, NO_EVIDENCE, OUTSIDE, UNKNOWN, SilhouetteTable
 from hull.witnesses import WitnessRule
 
 _N_ACROSS = 128
+# A silhouette is inverted, or full, when this share of its picture's edge is person; so many may be.
+_EDGE_SHARE, _MOST_INVERTED = 0.9, 0.25
+_MOST_NAMES = 8
 
 
 def why_empty(
@@ -52,6 +57,30 @@ def why_empty(
         "of them; do the calibration and the pictures belong together "
         "(units, picture size, order of the cameras)?"
     )
+
+
+def refuse_inverted(cameras: Sequence[Camera], images: Sequence[UInt8[np.ndarray, "_h _w"] | None]) -> None:
+    """Raise HullError where more than a quarter of the silhouettes show person all along the picture's edge.
+
+    Nobody stands so; carving would fill all of space.
+    """
+    present = [
+        (camera.name, image) for camera, image in zip(cameras, images, strict=False) if image is not None
+    ]
+    wrong = [name for name, image in present if _edge_is_person(image)]
+    if len(wrong) > _MOST_INVERTED * len(present):
+        raise HullError(
+            f"the silhouettes of {len(wrong)} of {len(present)} cameras show person all along the picture's "
+            f"edge ({_listed(wrong[:_MOST_NAMES])}{', ...' * (len(wrong) > _MOST_NAMES)}); are they "
+            "inverted? The person is white (255), the background black (0)"
+        )
+
+
+def _edge_is_person(image: UInt8[np.ndarray, "h w"]) -> bool:
+    inner = image[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX]
+    edge = np.concatenate([inner[0], inner[-1], inner[:, 0], inner[:, -1]]) if inner.size else inner.ravel()
+    known = edge[edge != UNKNOWN]
+    return bool(len(known)) and bool((known > UNKNOWN).mean() > _EDGE_SHARE)
 
 
 def volumes_without_each(

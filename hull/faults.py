@@ -22,7 +22,7 @@ from hull.culling import Culling
 from hull.errors import EmptyHullError, HullError
 from hull.evidence import MissedLines, missed_lines
 from hull.fault_kinds import CameraFault, FaultAction, FaultKind, classified, kept_against, shows_too_much
-from hull.holes import false_holes
+from hull.pockets import false_holes
 from hull.rays import RayScene
 from hull.tables import INSIDE, NO_EVIDENCE, SilhouetteTable, prepare_table, prepare_tables
 from hull.witnesses import WitnessRule, witness_rule
@@ -38,6 +38,12 @@ _SHARE, _FACTOR, _DEEP_SHARE, _N_ACCUSERS = 0.01, 5.0, 0.0005, 2
 # A camera shows too much when two others refuse this share of its lines, and so many times the typical share.
 _SURPLUS_SHARE = 0.1
 _MOST_ROUNDS = 8
+# A contradiction that stays is told from this share of all lines on (clean silhouettes leave none, nor do
+# ragged ones, nor a pixel of calibration), and from the second on the hull itself is not to be trusted.
+# Cameras that take part in nearly as much of it as the worst are named with it.
+_CONTRADICTION, WRONG_HULL, _AS_BAD = 0.005, 0.01, 0.85
+# Between three silhouettes nobody can judge.
+_FEWEST_TO_NAME = 4
 # If the hull explains so little, it may lie in the wrong place; nobody is larger than this around the middle.
 _MOSTLY_MISSED, _PERSON_M = 0.3, 1.3
 
@@ -77,6 +83,8 @@ class Settled:
     tables, rule, bounds : of the cameras that are left, some with unknown regions.
     n_lines (C,), missed : how the lines of sight of these tables fare with this surface.
     faults : one for each camera that contradicts the others, in the rig's order.
+    contradiction : share of the lines of sight that miss the surface because cameras contradict one another.
+    marks : a sentence where that is much.
     """
 
     carved: Carved
@@ -86,6 +94,8 @@ class Settled:
     n_lines: Int[np.ndarray, " c"]
     missed: MissedLines
     faults: tuple[CameraFault, ...]
+    contradiction: float
+    marks: tuple[str, ...]
 
 
 @dataclass
@@ -145,8 +155,8 @@ def settle(
         if not blamed and missed.scale * len(missed.table) > _MOSTLY_MISSED * n_lines.sum():
             # Faults that agree with each other may have put the box anywhere.
             blamed = _blamed(tables, *missed_lines(tables, rule, _around(tables), scene, votes))
-        if carved is not None and votes == 1:
-            blamed += [k for k in false_holes(tables, box) if k not in blamed]
+        if not blamed and carved is not None and votes == 1:
+            blamed = false_holes(tables, rule, box, bool(cameras.out or cameras.faults))
         room = cameras.room()
         again = [k for k in blamed if tables[k].camera_idx in cameras.faults]
         fresh = [k for k in blamed if tables[k].camera_idx not in cameras.faults]
@@ -163,6 +173,8 @@ def settle(
             continue
         if carved is None:
             assert error is not None
+            if _leave_out_blank(cameras):
+                continue
             raise error
         if cameras.unjudged and _judge(cameras, carved.scene, mend):
             continue
@@ -184,12 +196,21 @@ def _bounds_without_blank(cameras: _Cameras, near: Bounds | None) -> Bounds:
     try:
         return bounds_from_tables(cameras.present(), near)
     except HullError:
-        blank = [t.camera_idx for t in cameras.present() if _is_blank(t)]
-        if not blank or len(blank) > cameras.room():
+        if not _leave_out_blank(cameras):
             raise
-        cameras.out.update(blank)
-        cameras.unjudged.update(blank)
         return bounds_from_tables(cameras.present(), near)
+
+
+def _leave_out_blank(cameras: _Cameras) -> bool:
+    """Leave out the cameras that show nobody, if there are any and that may be."""
+    blank = [t.camera_idx for t in cameras.present() if _is_blank(t)]
+    # Where three others see somebody, one that sees nobody is wrong even in a small rig.
+    room = max(cameras.room(), int(len(cameras.tables) >= _FEWEST_TO_NAME and not cameras.out))
+    if not 0 < len(blank) <= room:
+        return False
+    cameras.out.update(blank)
+    cameras.unjudged.update(blank)
+    return True
 
 
 def _is_blank(table: SilhouetteTable) -> bool:
@@ -253,18 +274,51 @@ def _settled(
     unsettled: list[int],
 ) -> Settled:
     faults = dict(cameras.faults)
-    for k in unsettled:
-        share = missed.scale * missed.suspect[:, k].sum() / max(n_lines.sum(), 1)
-        faults[tables[k].camera_idx] = kept_against(tables[k], float(share))
     too_much = _share_of_lines(missed, missed.refused, n_lines)
     limit = max(_SURPLUS_SHARE, _FACTOR * float(np.median(too_much)))
-    for k in np.flatnonzero(too_much > limit).tolist():
+    generous = np.flatnonzero(too_much > limit)
+    # Lines of a camera that shows too much miss the hull, and rightly so.
+    counted = (missed.suspect.any(axis=1) | missed.refused) & ~np.isin(missed.table, generous)
+    per_line = missed.scale / max(int(n_lines.sum()), 1)
+    contradiction = per_line * float(counted.sum())
+    forbids = missed.suspect[counted].sum(axis=0)
+    part = forbids + np.bincount(missed.table[counted], minlength=len(tables))
+    if len(cameras.tables) >= FEWEST_TO_JUDGE:
+        shares = {k: per_line * float(missed.suspect[:, k].sum()) for k in unsettled}
+    elif contradiction > _CONTRADICTION and len(tables) >= _FEWEST_TO_NAME:
+        # Which of two it is that contradict each other is told by the others, if there are any.
+        worst = np.flatnonzero(part + forbids >= _AS_BAD * (part + forbids).max())
+        shares = {k: per_line * float(part[k]) for k in worst.tolist()}
+    else:
+        shares = {}
+    for k, share in shares.items():
+        faults[tables[k].camera_idx] = kept_against(tables[k], share)
+    for k in generous.tolist():
         if tables[k].camera_idx not in faults:
             faults[tables[k].camera_idx] = shows_too_much(
                 tables[k], cameras.images[tables[k].camera_idx], float(too_much[k])
             )
+    marks: tuple[str, ...] = ()
+    if contradiction > (_CONTRADICTION if not faults else WRONG_HULL):
+        marks = (_contradiction_mark(cameras, contradiction, set(faults)),)
     listed = tuple(faults[idx] for idx in sorted(faults))
-    return Settled(carved, tables, rule, bounds, n_lines, missed, listed)
+    return Settled(carved, tables, rule, bounds, n_lines, missed, listed, contradiction, marks)
+
+
+def _contradiction_mark(cameras: _Cameras, share: float, named: set[int]) -> str:
+    told = (
+        f"the silhouettes contradict one another: {share:.1%} of the lines of sight through them miss "
+        "the hull, which lacks a part or stands in the wrong place"
+    )
+    if named:
+        return f"{told}; look at {_names(cameras, named)} first"
+    few = len(cameras.tables) < _FEWEST_TO_NAME
+    why = (
+        f"{len(cameras.tables)} are too few to tell whose is wrong"
+        if few
+        else "look at the calibration, and whether all show the same moment"
+    )
+    return f"{told}; {why}"
 
 
 def _share_of_lines(

@@ -24,6 +24,9 @@ _ELSEWHERE_LINES, _ELSEWHERE_CAMERAS = 0.08, 0.5
 _OPEN_M2 = 0.005
 _OUTWARD_M = 0.03
 _MOST_NAMES = 8
+# Litres that a hull of one person does not leave: the most with very many cameras, and what so many times one
+# over their number adds (people of 110 kg in loose clothes stay a third below), and a small child.
+_MOST_L, _MORE_L, _LEAST_L = 170.0, 440.0, 8.0
 
 
 def one_subject(
@@ -115,6 +118,21 @@ def leaving_mark(
         f"the subject leaves what enough cameras see, near {_place(place)}: the hull ends there over about "
         f"{1e4 * area_m2:.0f} cm2 without an outline; {_names(blind)} do not see that place",
     )
+
+
+def size_mark(volume_m3: float, n_cameras: int) -> tuple[str, ...]:
+    """A sentence where a hull from so many cameras is larger or smaller than any one person's."""
+    litres, most = 1e3 * volume_m3, _MOST_L + _MORE_L / max(n_cameras, 1)
+    if litres > most:
+        return (
+            f"the hull holds {litres:.0f} L, more than one person does (up to {most:.0f} L with {n_cameras} "
+            "cameras): two people who touch, or a wrong unit?",
+        )
+    if litres < _LEAST_L:
+        return (
+            f"the hull holds {litres:.1f} L, less than a person does: silhouettes or calibration are wrong",
+        )
+    return ()
 
 
 def _place(point: Float[np.ndarray, " 3"]) -> str:

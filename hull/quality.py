@@ -1,4 +1,4 @@
-"""How well a surface explains the silhouettes, which cameras disagree, and what lies outside a hull."""
+"""How well a surface explains the silhouettes, and what lies outside a hull."""
 
 from __future__ import annotations
 
@@ -13,11 +13,6 @@ from hull.errors import HullError
 from hull.rays import RayScene
 from hull.tables import BORDER_PX, UNKNOWN
 from hull.visual_hull import Hull
-
-# A camera is suspicious when it lacks or adds more than this share, and this many times more than the typical
-# camera.
-_SUSPICIOUS_SHARE = 0.03
-_SUSPICIOUS_FACTOR = 4.0
 
 
 def projected_mask(
@@ -129,15 +124,6 @@ def _outline(mask: Bool[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]) -> F
     along = (mask[1:] != mask[:-1]) & known[1:] & known[:-1]
     half_right, half_down = np.array([0.0, 0.5]), np.array([0.5, 0.0])
     return np.concatenate([np.argwhere(across) + half_right, np.argwhere(along) + half_down])
-
-
-def suspicious_cameras(scores: Float[np.ndarray, " c"], names: Sequence[str]) -> tuple[str, ...]:
-    """Names of the cameras whose agreement (C,) is much worse than the rest's; NaN entries pass."""
-    shortfall = 1.0 - scores
-    limit = (
-        max(_SUSPICIOUS_SHARE, _SUSPICIOUS_FACTOR * float(np.nanmedian(shortfall))) if len(scores) else 0.0
-    )
-    return tuple(name for name, lack in zip(names, shortfall, strict=True) if lack > limit)
 
 
 def signed_distance(

@@ -17,7 +17,7 @@ from hull.bounds import Bounds, bounds_from_tables
 from hull.carve import Grid, carve
 from hull.cleaning import is_closed, keep_what_matters, vertex_normals
 from hull.culling import Culling
-from hull.diagnosis import why_empty
+from hull.diagnosis import refuse_inverted, why_empty
 from hull.errors import EmptyHullError, HullError
 from hull.faults import CameraFault, Carved, settle
 from hull.marching import binary_surface
@@ -78,7 +78,9 @@ class Hull:
     problems : one sentence each about what had to be left out or decided.
     faults : cameras whose silhouette contradicts the others, and what was done about each.
     marks : those of the problems that make the hull itself doubtful: a second subject, or one that leaves
-        what the cameras see.
+        what the cameras see, or silhouettes that contradict one another.
+    contradiction : share of the lines of sight through the silhouettes that miss the hull because cameras
+        contradict one another and too few can be left out; above 0.01 the hull is not to be trusted.
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -93,6 +95,7 @@ class Hull:
     problems: tuple[str, ...] = ()
     faults: tuple[CameraFault, ...] = ()
     marks: tuple[str, ...] = ()
+    contradiction: float = 0.0
 
     @staticmethod
     def of_mesh(
@@ -150,6 +153,7 @@ def build_hull(
     if options.soft and options.votes > 1:
         raise HullError("votes and soft silhouettes exclude each other; with soft ones doubts are summed")
 
+    refuse_inverted(cameras, images)
     soft = (
         {table.camera_idx: table for table in prepare_soft_tables(cameras, images)} if options.soft else None
     )
@@ -163,10 +167,15 @@ def build_hull(
 
     faults: tuple[CameraFault, ...] = ()
     marks: tuple[str, ...] = ()
+    contradiction = 0.0
     if options.find_faults:
         settled = settle(cameras, images, bounds, carve_with, options.votes, near, mend=soft is None)
         carved, faults, box = settled.carved, settled.faults, settled.bounds
-        marks = elsewhere_mark(carved.vertices, voxel_m, box, settled.tables, settled.n_lines, settled.missed)
+        contradiction = settled.contradiction
+        marks = (
+            *settled.marks,
+            *elsewhere_mark(carved.vertices, voxel_m, box, settled.tables, settled.n_lines, settled.missed),
+        )
     else:
         tables = prepare_tables(cameras, images)
         box = bounds if bounds is not None else bounds_from_tables(tables, near)
@@ -190,6 +199,7 @@ def build_hull(
         problems=(*carved.problems, *marks, *(fault.sentence() for fault in faults)),
         faults=faults,
         marks=marks,
+        contradiction=contradiction,
     )
 
 

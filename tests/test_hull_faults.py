@@ -11,9 +11,9 @@ import pytest
 from capture.layouts import dome_layout, ring_layout
 from capture.rig import Rig
 from hull.errors import HullError
-from hull.faults import CameraFault, FaultAction, FaultKind
+from hull.faults import WRONG_HULL, CameraFault, FaultAction, FaultKind
 from hull.visual_hull import Hull, HullOptions, build_hull
-from tests.hull_subjects import figure
+from tests.hull_subjects import Balls, figure
 
 Image = np.ndarray
 PLAIN = HullOptions(find_faults=False)
@@ -46,6 +46,21 @@ def with_a_hole(image: Image) -> Image:
     return cv2.circle(image, centre, max(int(0.035 * n), 6), 0, -1)
 
 
+def with_a_hole_in_a_thigh(image: Image) -> Image:
+    """As wide as the thigh, nearly."""
+    top, n = _extent(image)
+    row = top + int(0.62 * n)
+    columns = np.flatnonzero(image[row])
+    run = columns[: int(np.argmax(np.append(np.diff(columns) > 1, True))) + 1]
+    return cv2.circle(image, (int(run.mean()), row), int(0.034 * n), 0, -1)
+
+
+def without_the_head(image: Image) -> Image:
+    top, n = _extent(image)
+    image[: top + int(0.14 * n)] = 0
+    return image
+
+
 def inverted(image: Image) -> Image:
     return 255 - image
 
@@ -71,6 +86,8 @@ FAULTS: dict[Callable[[Image], Image], set[FaultKind]] = {
     without_a_leg: {FaultKind.PART_MISSING},
     without_the_lower_part: {FaultKind.PART_MISSING},
     with_a_hole: {FaultKind.PART_MISSING},
+    with_a_hole_in_a_thigh: {FaultKind.PART_MISSING},
+    without_the_head: {FaultKind.PART_MISSING},
     inverted: {FaultKind.INVERTED},
     of_another_frame: {FaultKind.MOVED, FaultKind.OTHER},
     shifted: {FaultKind.MOVED},
@@ -160,6 +177,32 @@ def test_a_camera_that_shows_too_much_is_told_of_and_kept(sixteen: Case) -> None
     assert abs(sixteen.change(hull)) < 0.01
 
 
+@pytest.mark.parametrize("culprit", [0, 3, 8, 11, 15])
+@pytest.mark.parametrize("place", [(0.0, 0.0, 1.2), (0.04, 0.0, 1.05)])
+def test_a_hole_in_the_trunk_is_found_in_any_camera(
+    sixteen: Case, culprit: int, place: tuple[float, float, float]
+) -> None:
+    """12 cm wide, and no other camera's line of sight says anything against it."""
+    camera = sixteen.rig[culprit]
+    pixels, depth = camera.project(np.array([place]))
+    centre = (round(float(pixels[0, 0])), round(float(pixels[0, 1])))
+    radius = round(0.06 * camera.intrinsics[0, 0] / float(depth[0]))
+    hull = sixteen.hull({culprit: lambda image: cv2.circle(image, centre, radius, 0, -1)})
+    assert [f.camera_idx for f in hull.faults] == [culprit], hull.problems
+    assert abs(sixteen.change(hull)) < 0.015
+
+
+def test_eight_cameras_find_a_hole_in_the_trunk() -> None:
+    rig = dome_layout(8, (512, 512))
+    images = figure().silhouettes(rig)
+    clean = build_hull(rig, images, 0.016)
+    assert clean.faults == ()
+    images[2] = with_a_hole(images[2])
+    hull = build_hull(rig, images, 0.016)
+    assert [f.camera_idx for f in hull.faults] == [2]
+    assert abs(hull.volume_m3 / clean.volume_m3 - 1) < 0.03
+
+
 def test_several_cameras_may_be_wrong_at_once(sixteen: Case) -> None:
     wrong = {1: without_the_lower_part, 6: inverted, 11: shifted, 14: empty}
     hull = sixteen.hull(wrong)
@@ -192,6 +235,70 @@ def test_few_cameras_are_told_of_and_kept() -> None:
     assert np.array_equal(hull.vertices, plain.vertices)
 
 
+@pytest.mark.parametrize("fault", [without_the_lower_part, inverted, of_another_frame, empty])
+@pytest.mark.parametrize("culprit", range(4))
+def test_of_four_cameras_none_is_silent(fault: Callable[[Image], Image], culprit: int) -> None:
+    """The hull may lose much; that it does is said, and the culprit is among those named."""
+    rig = dome_layout(4, (320, 320))
+    images = figure().silhouettes(rig)
+    images[culprit] = fault(images[culprit])
+    hull = build_hull(rig, images, 0.02)
+    assert culprit in {f.camera_idx for f in hull.faults}, hull.problems
+    if fault is empty:
+        assert hull.faults[0].action is FaultAction.LEFT_OUT, "three others see somebody"
+        assert hull.volume_m3 > 0.06
+        return
+    assert hull.contradiction > WRONG_HULL
+    (mark,) = hull.marks
+    assert mark.startswith("the silhouettes contradict one another: ")
+    assert f"camera {rig[culprit].name}" in mark.split("look at")[1]
+
+
+def test_three_cameras_are_too_few_to_tell_whose() -> None:
+    rig = ring_layout(3, (320, 320))
+    images = figure().silhouettes(rig)
+    assert build_hull(rig, images, 0.02).marks == ()
+    images[1] = without_the_lower_part(images[1])
+    hull = build_hull(rig, images, 0.02)
+    assert hull.faults == ()
+    assert hull.marks[0].endswith("; 3 are too few to tell whose is wrong")
+
+
+def test_half_of_the_cameras_from_another_frame(sixteen: Case) -> None:
+    """Nobody can say which half is right; that they disagree is said."""
+    assert sixteen.clean.contradiction == 0.0
+    there = Balls(figure().centres + np.array([0.06, 0.0, 0.0]), figure().radii).silhouettes(sixteen.rig)
+    images = [
+        image if k % 2 else other for k, (image, other) in enumerate(zip(sixteen.images, there, strict=True))
+    ]
+    hull = build_hull(sixteen.rig, images, sixteen.voxel_m)
+    assert hull.contradiction > WRONG_HULL
+    assert hull.marks[0].startswith("the silhouettes contradict one another: ")
+    assert hull.marks[0] in hull.problems
+
+
+def test_more_than_a_quarter_moved_is_marked_and_named(sixteen: Case) -> None:
+    wrong = dict.fromkeys((0, 3, 6, 9, 12), shifted)
+    hull = sixteen.hull(wrong)
+    assert {f.camera_idx for f in hull.faults} == set(wrong)
+    assert hull.contradiction > WRONG_HULL
+    assert all(sixteen.rig[k].name in hull.marks[0] for k in wrong)
+
+
+@pytest.mark.parametrize("n_wrong", [5, 16])
+def test_inverted_silhouettes_are_refused(sixteen: Case, n_wrong: int) -> None:
+    images = [255 - image if k < n_wrong else image for k, image in enumerate(sixteen.images)]
+    with pytest.raises(
+        HullError, match=f"{n_wrong} of 16 cameras show person all along .* are they inverted"
+    ):
+        build_hull(sixteen.rig, images, sixteen.voxel_m)
+
+
+def test_empty_silhouettes_are_refused(sixteen: Case) -> None:
+    with pytest.raises(HullError, match="0 of 16 silhouettes show anything"):
+        build_hull(sixteen.rig, [np.zeros_like(image) for image in sixteen.images], sixteen.voxel_m)
+
+
 @pytest.mark.parametrize("n_cameras", [16, 68])
 def test_ragged_outlines_and_a_pixel_of_calibration_are_no_faults(n_cameras: int) -> None:
     random = np.random.default_rng(n_cameras)
@@ -219,8 +326,6 @@ def test_specks_are_no_faults(sixteen: Case) -> None:
 
 def test_a_true_hole_is_no_fault() -> None:
     """A ring held up has a hole that some cameras see through."""
-    from tests.hull_subjects import Balls
-
     angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     ring = np.column_stack([0.35 * np.cos(angle), np.zeros(60), 1.1 + 0.35 * np.sin(angle)])
     subject = Balls(ring, np.full(60, 0.06))

@@ -13,6 +13,7 @@ from capture.layouts import dome_layout, ring_layout
 from capture.rig import Rig
 from hull.bounds import Bounds
 from hull.cleaning import is_closed
+from hull.marks import size_mark
 from hull.quality import share_outside
 from hull.visual_hull import HullOptions, build_hull
 from tests.hull_subjects import Balls, figure
@@ -132,3 +133,16 @@ def test_half_the_cameras_cropped_at_sixty_per_cent(n_cameras: int, lower: bool)
     assert hull.faults == ()
     plain = build_hull(Rig(tuple(cameras)), images, 0.016, options=HullOptions(find_faults=False))
     assert np.array_equal(plain.vertices, hull.vertices)
+
+
+def test_a_hull_as_large_as_two_people_or_smaller_than_one() -> None:
+    """People of 110 kg in loose clothes stay below, with few cameras too."""
+    for n_cameras, litres in ((3, 195), (4, 190), (8, 150), (16, 150), (68, 150)):
+        assert size_mark(litres / 1000, n_cameras) == ()
+    assert size_mark(0.015, 16) == (), "a small child"
+    (mark,) = size_mark(0.240, 16)
+    assert mark.startswith(
+        "the hull holds 240 L, more than one person does (up to 198 L with 16 cameras): two"
+    )
+    (mark,) = size_mark(0.0014, 16)
+    assert mark.startswith("the hull holds 1.4 L, less than a person does")

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bodyhull.carving import often_at_fault
+from bodyhull.carving import compare_volumes, often_at_fault
 from capture.layouts import dome_layout
 from tests.capture_scenes import silhouette_path, write_inria
 from tests.command_line import Said, call
@@ -40,6 +40,10 @@ def change(recording: Path, camera_idx: int, frame_id: int, how: str) -> None:
         image[int(rows.mean()) :] = 0
     elif how == "moved":
         image = np.roll(image, 14, axis=1)
+    elif how == "inverted":
+        image = 255 - image
+    elif how == "empty":
+        image[:] = 0
     else:
         image = cv2.GaussianBlur(image, (0, 0), 1.5)
     cv2.imwrite(path, image)
@@ -127,3 +131,56 @@ def test_how_often_is_often() -> None:
         "camera cam-003 contradicts the others in 4 of 10 frames; look at its calibration"
     ]
     assert often_at_fault({"000000": {"status": "failed"}}) == []
+
+
+def test_too_many_wrong_make_the_frame_suspect(recording: Path, capsys: Capture) -> None:
+    """The hull is kept, the cameras are named, and the exit code says it; a resumed run says it again."""
+    for camera_idx in range(0, 10, 2):
+        change(recording, camera_idx, 1, "moved")
+    for _ in range(2):
+        said = carve(capsys, recording)
+        assert said.code == 3
+        assert "1 of 3 frames have a hull that is not to be trusted (see their problems" in said.err
+        assert said.err.rstrip().endswith("in run.json): 000001")
+    frame = hull_stage(recording)["000001"]
+    assert frame["status"] == "suspect"
+    assert any(p.startswith("the silhouettes contradict one another: ") for p in frame["problems"])
+    assert (recording.parent / "run" / "hull" / "000001.ply").is_file()
+
+
+@pytest.mark.parametrize("how", ["inverted", "empty"])
+def test_a_frame_without_any_right_silhouette_fails(recording: Path, capsys: Capture, how: str) -> None:
+    for camera_idx in range(10):
+        change(recording, camera_idx, 2, how)
+    said = carve(capsys, recording)
+    assert said.code == 3
+    assert "1 of 3 frames failed in stage hull: 000002" in said.err
+    frame = hull_stage(recording)["000002"]
+    assert frame["status"] == "failed"
+    wrong = {"inverted": "silhouette looks inverted", "empty": "silhouette is empty"}[how]
+    assert wrong in " ".join(frame["problems"])
+
+
+def test_volumes_are_compared_over_the_frames() -> None:
+    def frames(volumes: list[float]) -> dict:
+        return {f"{k:06d}": {"status": "ok", "problems": [], "volume_m3": v} for k, v in enumerate(volumes)}
+
+    steady = frames([0.080, 0.082, 0.079, 0.085, 0.081, 0.077])
+    assert compare_volumes(steady, 16) == []
+    assert compare_volumes(frames([0.08, 0.16]), 16) == [], "too few to know who is odd"
+    odd = frames([0.080, 0.081, 0.150, 0.080, 0.079, 0.040])
+    told = dict(compare_volumes(odd, 16))
+    assert set(told) == {"000002", "000005"}
+    assert told["000002"] == (
+        "the hull holds 150 L, 188% of the median over the frames: a second person, or somebody's things?"
+    )
+    assert told["000005"].endswith("50% of the median over the frames: is a part missing?")
+    assert [odd[k]["status"] for k in sorted(odd)] == ["ok", "ok", "suspect", "ok", "ok", "suspect"]
+    assert dict(compare_volumes(odd, 16)) == told, "said once, however often it is asked"
+    assert len(odd["000002"]["problems"]) == 1
+    odd["000002"]["volume_m3"] = 0.081
+    compare_volumes(odd, 16)
+    assert odd["000002"]["status"] == "ok"
+    assert odd["000002"]["problems"] == []
+    wide = frames([0.080, 0.081, 0.115, 0.080, 0.079])
+    assert compare_volumes(wide, 4) == [], "with few cameras volumes are less steady"
