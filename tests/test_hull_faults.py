@@ -249,8 +249,7 @@ def test_of_four_cameras_none_is_silent(fault: Callable[[Image], Image], culprit
         assert hull.volume_m3 > 0.06
         return
     assert hull.contradiction > WRONG_HULL
-    (mark,) = hull.marks
-    assert mark.startswith("the silhouettes contradict one another: ")
+    (mark,) = [m for m in hull.marks if m.startswith("the silhouettes contradict one another: ")]
     assert f"camera {rig[culprit].name}" in mark.split("look at")[1]
 
 
