@@ -23,11 +23,12 @@ from fit.body.model import BodyModel, load_body
 from fit.body.pose_prior import PosePrior
 from fit.closest import Container
 from fit.frames import apply, recording_from_body, scan_in_body_frame
-from fit.fuse import FusionShape, fuse
+from fit.fuse import FusionShape, fused
 from fit.initialise import PoseFinder
 from fit.settings import FitSettings
 from fit.solver import Fitter
 from fit.state import BodyState
+from fit.thickness import Thickness
 from fit.track import TrackedFrame, posed_vertices, track_sequence
 from hull.hull_file import load_hull
 from hull.mesh_file import load_mesh, save_mesh
@@ -107,7 +108,7 @@ def fit_stage(config: RunConfig, settings: FitSettings | None = None) -> None:
     alignments = _align(folder, fitter, finder, scans, keypoints, settings, settings_key, config.overwrite)
     if all(a.status == "failed" for a in alignments):
         raise UserError(f"{folder.root}: no frame could be aligned; {alignments[0].message}")
-    fusion = fuse(fitter, alignments, settings)
+    fusion, alignments = fused(fitter, finder, alignments, settings)
     _save_fusion(folder, model, fusion, world_from_body)
     with tqdm(total=len(alignments), desc="track", unit="frame") as bar:
         track = track_sequence(
@@ -289,11 +290,24 @@ def _save_fusion(
         spread=fusion.spread,
         fit_scale=fusion.fit_scale,
         trust=fusion.trust,
+        **_clothes(fusion),
         faces=model.faces,
         body=model.name,
         body_hash=model.content_hash,
     )
     save_mesh(folder.fusion_mesh, apply(world_from_body, fusion.template), model.faces)
+
+
+def _clothes(fusion: FusionShape) -> dict[str, np.ndarray]:
+    """What is known of the clothes, for the file; nothing where their movement could not be read."""
+    if fusion.thickness is None or fusion.confidence is None:
+        return {}
+    return {
+        "thickness": fusion.thickness.expected,
+        "tolerance": fusion.thickness.tolerance,
+        "movement": fusion.thickness.movement,
+        "confidence": fusion.confidence,
+    }
 
 
 def load_fusion(folder: RunFolder) -> FusionShape:
@@ -308,6 +322,10 @@ def load_fusion(folder: RunFolder) -> FusionShape:
         found["spread"],
         found["fit_scale"],
         float(found["trust"]),
+        Thickness(found["thickness"], found["tolerance"], found["movement"])
+        if "confidence" in found
+        else None,
+        found.get("confidence"),
     )
 
 

@@ -11,13 +11,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_matrix
 
 from fit.align import Alignment
+from fit.initialise import PoseFinder
 from fit.settings import FitSettings
 from fit.solver import Fitter, Objective, ScanPoints, Unknowns, minimise
 from fit.state import BodyState
 from fit.surface import vertex_normals
+from fit.thickness import Thickness, smoothed_over_mesh
+from fit.together import ENOUGH_FRAMES, Together, can_be_together, fit_together
 
 #: Unposed vertices this many robust deviations inside the others are lost points, not a tighter fit.
 CLIP_MAD = 3.5
@@ -28,9 +30,10 @@ CLIP_FLOOR_M = 0.004
 class FusionShape:
     """T_Fu: template (V 3) m in the zero pose, betas of the model coupled to it, joints (J 3) m.
 
-    spread (V): deviation of the unposed alignments along the normal, m (the paper's figure 2 colours by it).
-    fit_scale (V): factor on lambda_fit that was derived from it; trust: how far the hulls could be
-    trusted, 0 to 1.
+    thickness: of the clothes, where it could be told; confidence (V), 0 to 1: how well the place of the skin
+    is known, as the tolerance of bare skin over that found here. spread (V): deviation of the unposed
+    alignments along the normal, m (the paper's figure 2 colours by it). fit_scale (V): factor on lambda_fit
+    that was derived from it; trust: how far the hulls could be trusted, 0 to 1.
     """
 
     template: Float[np.ndarray, "v 3"]
@@ -39,6 +42,8 @@ class FusionShape:
     spread: Float[np.ndarray, "v"]
     fit_scale: Float[np.ndarray, "v"]
     trust: float = 1.0
+    thickness: Thickness | None = None
+    confidence: Float[np.ndarray, "v"] | None = None
 
 
 def lost_points(
@@ -52,19 +57,6 @@ def lost_points(
     median = np.median(offsets, axis=0)
     spread = 1.4826 * np.median(np.abs(offsets - median), axis=0)
     return offsets < median - np.maximum(clip_mad * spread, floor_m)
-
-
-def smoothed_over_mesh(
-    value: Float[np.ndarray, "v"], faces: Int[np.ndarray, "f 3"], rounds: int
-) -> Float[np.ndarray, "v"]:
-    """Repeated means over a vertex and its neighbours: after n rounds about sqrt(n) edges wide."""
-    n = len(value)
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    adjacency = coo_matrix((np.ones(len(edges)), edges.T), shape=(n, n)).tocsr()
-    count = np.asarray(adjacency.sum(axis=1)).ravel() + 1.0
-    for _ in range(rounds):
-        value = (value + adjacency @ value) / count
-    return value
 
 
 def trust_in_spread(alignments: Sequence[Alignment], settings: FitSettings) -> float:
@@ -94,20 +86,96 @@ def fit_scale_from_spread(
     return np.clip(scale, *settings.fit_scale_limits) * settings.doubtful_fit ** ((1.0 - trust) ** 2)
 
 
+def usable(alignments: Sequence[Alignment]) -> list[Alignment]:
+    """Those that are in order, or else all that did not fail. Raises ValueError when there is none."""
+    good = [a for a in alignments if a.status == "ok"] or [a for a in alignments if a.status != "failed"]
+    if not good:
+        raise ValueError("no frame could be aligned, so there is nothing to fuse")
+    return good
+
+
+def fused(
+    fitter: Fitter, finder: PoseFinder, alignments: Sequence[Alignment], settings: FitSettings
+) -> tuple[FusionShape, list[Alignment]]:
+    """The fusion shape, and the alignments with the poses to track from.
+
+    Where the clothes' movement can be read, one shape and all poses are found at once; else every frame keeps
+    the pose it was aligned with. Raises ValueError when no frame was aligned.
+    """
+    good = usable(alignments)
+    if not can_be_together(good, trust_in_spread(good, settings)):
+        return fuse(fitter, alignments, settings), list(alignments)
+    together = fit_together(fitter, finder, good, settings)
+    again = together.realigned(fitter, good)
+    by_frame = {a.frame_id: a for a in again}
+    # A suspect frame does not speak for the shape, but it is tracked like the others.
+    return (
+        fuse_together(fitter, again, together, settings),
+        [by_frame.get(a.frame_id, a) for a in alignments],
+    )
+
+
+def fuse_together(
+    fitter: Fitter, alignments: Sequence[Alignment], together: Together, settings: FitSettings
+) -> FusionShape:
+    """The fusion shape where pose and betas are known from all frames, and the clothes' thickness with them.
+
+    E_outside keeps the template inside all unposed clothed templates (as `fuse`); in place of E_fit, which
+    draws it to the cloth, it is drawn to where the skin is expected under their mean, as tightly as
+    the thickness is known. Coupled to M(betas); the joints stay.
+    """
+    model = fitter.model
+    template, joints = fitter.shaped(together.betas), fitter.joints(together.betas)
+    clothed = np.stack([a.state.template for a in alignments])
+    n, normals = len(clothed), vertex_normals(template, model.faces)
+    expected = clothed.mean(0) - together.thickness.expected[:, None] * normals
+    certainty = (settings.thickness.tolerance_m / together.thickness.tolerance) ** 2
+    offsets = np.einsum("tva,va->tv", clothed - clothed.mean(0), normals)
+    keep = ~lost_points(offsets) if n >= ENOUGH_FRAMES else np.ones(offsets.shape, dtype=bool)
+    # Both terms are means over their points times the number of vertices, whatever the number of frames.
+    scan = ScanPoints(
+        np.concatenate([clothed.reshape(-1, 3), expected]),
+        np.concatenate([*(vertex_normals(t, model.faces) for t in clothed), normals]),
+        np.concatenate([keep.ravel() * (n + 1) / n, certainty * (n + 1)]),
+        np.repeat([False, True], [offsets.size, model.n_vertices]),
+    )
+    state = BodyState(template, np.zeros((model.n_joints, 3)), np.zeros(3), together.betas)
+    pose_size = 3 * (model.n_joints - 1)
+    for stage in settings.fuse_together:
+        objective = Objective(
+            fitter,
+            scan,
+            stage,
+            Unknowns(pose=False, translation=False, betas=False),
+            np.zeros(pose_size),
+            np.zeros((pose_size, pose_size)),
+            target=template,
+            joints=joints,
+        )
+        state = minimise(objective, state, settings.max_iterations, settings.relative_drop).state
+    return FusionShape(
+        state.template,
+        together.betas,
+        joints,
+        offsets.std(axis=0),
+        settings.sure_fit * certainty**3,
+        thickness=together.thickness,
+        confidence=np.sqrt(certainty),
+    )
+
+
 def fuse(fitter: Fitter, alignments: Sequence[Alignment], settings: FitSettings) -> FusionShape:
     """Estimate the fusion shape from all alignments that did not fail.
 
     Raises ValueError when there is none.
     """
-    good = [a for a in alignments if a.status == "ok"] or [a for a in alignments if a.status != "failed"]
-    if not good:
-        raise ValueError("no frame could be aligned, so there is nothing to fuse")
+    good = usable(alignments)
     templates = np.stack([a.state.template for a in good])
     betas = np.median([a.state.betas for a in good], axis=0)
     mean = templates.mean(0)
     normals = vertex_normals(mean, fitter.model.faces)
     offsets = np.einsum("tva,va->tv", templates - mean, normals)
-    keep = ~lost_points(offsets) if len(good) >= 4 else np.ones(offsets.shape, dtype=bool)
+    keep = ~lost_points(offsets) if len(good) >= ENOUGH_FRAMES else np.ones(offsets.shape, dtype=bool)
     points = templates.reshape(-1, 3)
     scan = ScanPoints(
         points,
@@ -116,7 +184,7 @@ def fuse(fitter: Fitter, alignments: Sequence[Alignment], settings: FitSettings)
         np.zeros(len(points), dtype=bool),
     )
     spread = offsets.std(axis=0)
-    enough = len(good) >= 4
+    enough = len(good) >= ENOUGH_FRAMES
     fit_scale, trust = np.ones(len(spread)), 1.0
     if enough:
         trust = trust_in_spread(good, settings)

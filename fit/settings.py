@@ -40,6 +40,12 @@ def _fusion_stage(coupling: float) -> StageWeights:
     return StageWeights(cloth=True, sigma_m=0.02, fit=0.03, coupling=coupling, tether=1e-3, gate=False)
 
 
+def _fusion_together(coupling: float) -> StageWeights:
+    return StageWeights(
+        cloth=True, sigma_m=0.005, fit=0.0, outside_m=0.004, coupling=coupling, tether=1e-3, gate=False
+    )
+
+
 def _track_pose() -> StageWeights:
     return StageWeights(cloth=True, sigma_m=0.05, fit=1.0, inside=1.0)
 
@@ -48,6 +54,48 @@ def _track_template() -> StageWeights:
     return StageWeights(
         cloth=True, sigma_m=0.02, fit=0.015, coupling=0.3, tether=1e-3, inside=5.0, margin_m=0.0005
     )
+
+
+@dataclass(frozen=True)
+class ThicknessSettings:
+    """How movement of the cloth tells its thickness (`fit.thickness`).
+
+    per_movement: factor on the ratio of thickness to deviation along the normal; thinnest_m: what cloth that
+    never moves (and the hull's own excess) stands away; swing_m: movement whose thickness is half of what the
+    ratio says; tolerance_share: how far that may be off; tolerance_m, noise_m: tolerance and deviation where
+    there is no cloth; largest_movement_m: more is no cloth either; pooling_rounds: means over neighbours
+    before deviations are compared.
+    """
+
+    per_movement: float = 1.0
+    thinnest_m: float = 0.001
+    swing_m: float = 0.04
+    tolerance_share: float = 0.4
+    tolerance_m: float = 0.002
+    noise_m: float = 0.001
+    largest_movement_m: float = 0.03
+    pooling_rounds: int = 15
+
+
+@dataclass(frozen=True)
+class TogetherSettings:
+    """One shape and all poses at once (`fit.together`).
+
+    n_independent: independent observations that a frame's surface is worth; outlier: residuals of so many
+    tolerances count half; outside_m: how far cloth may be inside the body; shape_prior: of the betas, times
+    the number of frames; pose_prior: a frame; every_vertex: only every n-th vertex is summed; shape_frames:
+    at most so many frames find the betas; rounds, rest: at most so many, until nothing moves farther.
+    """
+
+    n_independent: float = 300.0
+    outlier: float = 3.0
+    outside_m: float = 0.001
+    shape_prior: float = 1.0
+    pose_prior: float = 1.0
+    every_vertex: int = 2
+    shape_frames: int = 40
+    rounds: int = 10
+    rest: float = 0.02
 
 
 @dataclass(frozen=True)
@@ -66,8 +114,15 @@ class FitSettings:
     align_joint: tuple[StageWeights, ...] = (
         StageWeights(cloth=False, sigma_m=0.05, coupling=1.0, tether=1e-2),
     )
+    thickness: ThicknessSettings = field(default_factory=ThicknessSettings)
+    together: TogetherSettings = field(default_factory=TogetherSettings)
     #: Fusion shape, stiff then soft: every vertex of every unposed alignment is a cloth point.
     fuse: tuple[StageWeights, ...] = (_fusion_stage(5.0), _fusion_stage(0.1))
+    #: The same where the clothes' thickness is known: the skin term holds what is expected under the cloth.
+    fuse_together: tuple[StageWeights, ...] = (_fusion_together(5.0), _fusion_together(0.1))
+    #: Factor on lambda_fit in tracking where the skin is known best; it falls with the third power of the
+    #: certainty, so that bare parts follow the scan and covered ones the fusion shape.
+    sure_fit: float = 60.0
     #: Tracking. Cloth drags a pose less when it is taken as skin on all sides (fit 1, the same
     #: everywhere) than when the body hangs on its tightest regions; the template then settles with
     #: the pose held.

@@ -11,11 +11,12 @@ from jaxtyping import Float
 
 from fit.align import Alignment, as_scan_points, mean_distance
 from fit.closest import Container
-from fit.fuse import FusionShape, smoothed_over_mesh
+from fit.fuse import FusionShape
 from fit.initialise import PoseFinder
 from fit.settings import FitSettings
 from fit.solver import Fitter, Objective, Unknowns, minimise
 from fit.state import BodyState
+from fit.thickness import smoothed_over_mesh
 from hull.scan import Scan
 
 #: How far outside the hull a vertex is brought back from, how deep inside it goes, and in how many rounds.

@@ -1,0 +1,235 @@
+"""One shape and all poses at once, inside clothes of a thickness that is estimated along the way.
+
+The paper aligns frame by frame and fuses afterwards, because solving for all frames' 150 000 points at once
+was too much (section 4.2). Posed alignments make it cheap: each is 6890 points whose partner on the body is
+known. A frame adds a small dense block, its pose is eliminated (Schur complement), and what remains is a
+system of the size of the betas. Cloth then drags neither the pose of a frame nor the bones on its own: a
+shape that has to serve all frames, with the cloth where its movement says it should be, decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.linalg import cho_factor, cho_solve
+
+from fit.align import Alignment
+from fit.body.parts import region_of_vertices
+from fit.initialise import PoseFinder
+from fit.settings import FitSettings, TogetherSettings
+from fit.solver import Fitter
+from fit.state import BodyState
+from fit.surface import vertex_areas, vertex_normals
+from fit.thickness import Thickness, bending_noise, expected_thickness, thickness_per_movement
+
+#: Parts that shoes, hair and coarse hulls make unreliable count this much.
+VAGUE_PARTS, VAGUE_WEIGHT = ("hand", "foot", "head"), 0.3
+#: Alignment and body whose normals differ more than this (cosine) are not the same part.
+SAME_SIDE = 0.3
+LARGEST_TURN, LARGEST_BETA_STEP = 0.3, 1.0
+#: Fewer frames say nothing about movement; hulls trusted less move on their own.
+ENOUGH_FRAMES, TRUSTED = 4, 0.5
+
+
+@dataclass(frozen=True)
+class Together:
+    """poses (T J 3), translations (T 3) of the frames given; betas (B); the clothes over the body; the
+    energy a round."""
+
+    poses: Float[np.ndarray, "t j 3"]
+    translations: Float[np.ndarray, "t 3"]
+    betas: Float[np.ndarray, "b"]
+    thickness: Thickness
+    energies: tuple[float, ...]
+
+    def realigned(self, fitter: Fitter, alignments: Sequence[Alignment]) -> list[Alignment]:
+        """The same posed alignments with these poses and betas: their templates are unposed anew."""
+        template, joints = fitter.shaped(self.betas), fitter.joints(self.betas)
+        out = []
+        for alignment, pose, translation in zip(alignments, self.poses, self.translations, strict=True):
+            vertices, rotations, _ = fitter.linearised(
+                BodyState(template, pose, translation, self.betas), joints
+            )
+            gap = fitter.posed(alignment.state) - vertices
+            own = template + np.linalg.solve(rotations, gap[:, :, None])[:, :, 0]
+            out.append(replace(alignment, state=BodyState(own, pose, translation, self.betas)))
+        return out
+
+
+@dataclass
+class _Frames:
+    """What is iterated: poses and translations of all frames, one set of betas."""
+
+    poses: Float[np.ndarray, "t j 3"]
+    translations: Float[np.ndarray, "t 3"]
+    betas: Float[np.ndarray, "b"]
+
+
+@dataclass(frozen=True)
+class _Cloth:
+    """The posed alignments: vertices and normals (T V 3)."""
+
+    vertices: Float[np.ndarray, "t v 3"]
+    normals: Float[np.ndarray, "t v 3"]
+
+
+def can_be_together(alignments: Sequence[Alignment], trust: float) -> bool:
+    """Whether movement tells thickness: enough frames, and hulls that do not change on their own."""
+    return len(alignments) >= ENOUGH_FRAMES and trust >= TRUSTED
+
+
+def fit_together(
+    fitter: Fitter, finder: PoseFinder, alignments: Sequence[Alignment], settings: FitSettings
+) -> Together:
+    """Minimise over betas and all poses
+
+        sum_frames sum_vertices n a w rho((n.(cloth - body) - thickness) / tolerance) + outside + priors
+
+    a: the vertex's share of the area, w: less for hands, feet and head, n: independent observations a frame.
+    The thickness is estimated anew every round from the same residuals. Shapes have to explain all frames, so
+    at most `shape_frames` of them (evenly spread) take part in finding the betas; the others' poses follow.
+    """
+    weights = settings.together
+    posed = np.stack([fitter.posed(a.state) for a in alignments])
+    cloth = _Cloth(posed, np.stack([vertex_normals(v, fitter.model.faces) for v in posed]))
+    at = _Frames(
+        np.stack([a.state.pose for a in alignments]),
+        np.stack([a.state.translation for a in alignments]),
+        np.median([a.state.betas for a in alignments], axis=0),
+    )
+    n = len(alignments)
+    chosen = np.unique(np.linspace(0, n - 1, min(n, weights.shape_frames)).round().astype(int))
+    rest = np.setdiff1d(np.arange(n), chosen)
+    energies: list[float] = []
+    thickness = None
+    for _ in range(weights.rounds):
+        thickness, energy, moved = _round(fitter, finder, cloth, at, chosen, settings, None)
+        energies.append(energy)
+        if moved < weights.rest:
+            break
+    assert thickness is not None, "at least one round"
+    for k in rest:
+        for _ in range(weights.rounds):
+            _, _, moved = _round(fitter, finder, cloth, at, np.array([k]), settings, thickness)
+            if moved < weights.rest:
+                break
+    return Together(at.poses, at.translations, at.betas, thickness, tuple(energies))
+
+
+def _round(
+    fitter: Fitter,
+    finder: PoseFinder,
+    cloth: _Cloth,
+    at: _Frames,
+    chosen: Int[np.ndarray, "k"],
+    settings: FitSettings,
+    held: Thickness | None,
+) -> tuple[Thickness, float, float]:
+    """One Gauss-Newton step of the chosen frames' poses and, unless the thickness is held, of the betas.
+
+    Returns thickness, energy before the step, and the largest move (rad or betas)."""
+    weights, model = settings.together, fitter.model
+    template, joints = fitter.shaped(at.betas), fitter.joints(at.betas)
+    frames = []
+    for k in chosen:
+        state = BodyState(template, at.poses[k], at.translations[k], at.betas)
+        vertices, rotations, jacobian = fitter.linearised(state, joints)
+        normals = vertex_normals(vertices, model.faces)
+        offset = np.einsum("va,va->v", cloth.vertices[k] - vertices, normals)
+        same = np.einsum("va,va->v", cloth.normals[k], normals) > SAME_SIDE
+        frames.append((vertices, rotations, jacobian, normals, offset, same))
+    thickness = held
+    if thickness is None:
+        noise = bending_noise(model, at.poses[chosen], vertex_normals(template, model.faces))
+        offsets = np.stack([f[4] for f in frames])
+        thickness = expected_thickness(
+            offsets, noise, thickness_per_movement(model), model.faces, settings.thickness
+        )
+    part_weight = np.where(np.isin(region_of_vertices(model), VAGUE_PARTS), VAGUE_WEIGHT, 1.0)
+    n_betas = 0 if held is not None else model.n_betas
+    shape_prior = weights.shape_prior * len(chosen)
+    reduced, pull = shape_prior * np.eye(n_betas), -shape_prior * at.betas[:n_betas]
+    energy = shape_prior * float(at.betas @ at.betas)
+    eliminated = []
+    for k, (vertices, rotations, jacobian, normals, offset, same) in zip(chosen, frames, strict=True):
+        area = vertex_areas(vertices, model.faces)
+        share = weights.n_independent * part_weight * same * area / area.sum()
+        residual, weight, data = _data_term(offset, thickness, share, weights)
+        energy += data
+        used = np.flatnonzero(weight > 0)[:: weights.every_vertex]
+        along = _along_normals(fitter, at.poses[k], rotations, jacobian, normals, used, n_betas)
+        weighted = along * (weights.every_vertex * weight[used])[:, None]
+        hessian, gradient = weighted.T @ along, weighted.T @ residual[used]
+        n_pose = jacobian.shape[1]
+        own, rhs = hessian[:n_pose, :n_pose], gradient[:n_pose]
+        away = at.poses[k].ravel()[3:] - finder.prior.mean
+        own[3:-3, 3:-3] += weights.pose_prior * finder.prior.precision
+        rhs[3:-3] -= weights.pose_prior * finder.prior.precision @ away
+        own[np.diag_indices(n_pose)] += 1e-3 * weights.n_independent
+        energy += weights.pose_prior * float(away @ finder.prior.precision @ away)
+        cross, factor = hessian[:n_pose, n_pose:], cho_factor(own)
+        reduced += hessian[n_pose:, n_pose:] - cross.T @ cho_solve(factor, cross)
+        pull += gradient[n_pose:] - cross.T @ cho_solve(factor, rhs)
+        eliminated.append((k, factor, cross, rhs))
+    step = np.linalg.solve(reduced, pull)
+    moved = float(np.abs(step).max(initial=0.0))
+    step = step * min(1.0, LARGEST_BETA_STEP / max(moved, 1e-12))
+    if n_betas:
+        at.betas = at.betas + step
+    for k, factor, cross, rhs in eliminated:
+        move = cho_solve(factor, rhs - cross @ step)
+        turn = float(np.abs(move[:-3]).max())
+        move = move * min(1.0, LARGEST_TURN / max(turn, 1e-12))
+        moved = max(moved, turn)
+        at.poses[k] += move[:-3].reshape(-1, 3)
+        at.translations[k] += move[-3:]
+    return thickness, energy, moved
+
+
+def _data_term(
+    offset: Float[np.ndarray, "v"],
+    thickness: Thickness,
+    share: Float[np.ndarray, "v"],
+    weights: TogetherSettings,
+) -> tuple[Float[np.ndarray, "v"], Float[np.ndarray, "v"], float]:
+    """Residual (m), weight of its square, and energy: cloth at its expected distance (Geman-McClure on
+    residual over tolerance), and never inside the body (quadratic)."""
+    residual = offset - thickness.expected
+    scaled = (residual / (weights.outlier * thickness.tolerance)) ** 2
+    fit_weight = share / thickness.tolerance**2 / (1.0 + scaled) ** 2
+    energy = share * (residual / thickness.tolerance) ** 2 / (1.0 + scaled)
+    inside = offset < 0
+    outside_weight = np.where(inside, share / weights.outside_m**2, 0.0)
+    energy = energy + outside_weight * offset**2
+    # Both pull along the same normal: one residual with their summed weight.
+    weight = fit_weight + outside_weight
+    return (
+        (fit_weight * residual + outside_weight * offset) / np.maximum(weight, 1e-30),
+        weight,
+        float(energy.sum()),
+    )
+
+
+def _along_normals(
+    fitter: Fitter,
+    pose: Float[np.ndarray, "j 3"],
+    rotations: Float[np.ndarray, "v 3 3"],
+    jacobian: Float[np.ndarray, "m p"],
+    normals: Float[np.ndarray, "v 3"],
+    used: Int[np.ndarray, "n"],
+    n_betas: int,
+) -> Float[np.ndarray, "n q"]:
+    """How far the used vertices move along their normals with pose, translation and betas."""
+    normal = normals[used]
+    by_pose = np.einsum("na,nap->np", normal, jacobian.reshape(len(normals), 3, -1)[used])
+    if not n_betas:
+        return by_pose
+    shape = fitter.shape
+    turned = np.einsum("na,nab->nb", normal, rotations[used])
+    by_template = np.einsum("nb,nbk->nk", turned, fitter.model.shape_directions[used])
+    # A bone's offset moves a vertex by the vertex's weight on that bone.
+    bones = (fitter.model.weights[used][:, :, None] * normal[:, None, :]).reshape(len(used), -1)
+    return np.concatenate([by_pose, by_template + bones @ shape.offsets_by_betas(pose)], axis=1)

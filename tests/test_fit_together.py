@@ -1,0 +1,177 @@
+"""One shape and all poses at once: clothes that move give away their thickness, skin that does not is kept."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from fit.align import Alignment
+from fit.evaluate import Surface, signed_error_mm
+from fit.fuse import FusionShape, fused, usable
+from fit.settings import FitSettings
+from fit.state import BodyState
+from fit.surface import vertex_normals
+from fit.thickness import bending_noise, expected_thickness, thickness_per_movement
+from fit.together import Together, can_be_together, fit_together
+from tests.test_fit_pose_finding import finder, fitter
+
+SETTINGS = FitSettings(n_points=6000)
+N_FRAMES = 6
+
+
+@cache
+def true_states() -> tuple[BodyState, ...]:
+    """A person within the shape space who steps and lifts his arms."""
+    betas = np.zeros(fitter().model.n_betas)
+    betas[:4] = [0.8, 0.7, -0.5, 0.6]
+    states = []
+    for k in range(N_FRAMES):
+        pose = finder().mean_pose()
+        pose[0] = [0.0, 0.2 * k, 0.0]
+        pose[1] += [-0.1 * k, 0.0, 0.0]
+        pose[17] += [0.0, 0.1 * k, -0.1 * k]
+        states.append(BodyState(fitter().shaped(betas), pose, np.array([0.04 * k, 0.9, 0.0]), betas))
+    return tuple(states)
+
+
+def covered() -> np.ndarray:
+    """Vertices under a shirt and trousers."""
+    zero = true_states()[0].template
+    return (np.abs(zero[:, 0]) < 0.35) & (zero[:, 1] < 0.4) & (zero[:, 1] > -0.7)
+
+
+@cache
+def clothed(mean_m: float) -> tuple[Alignment, ...]:
+    """Alignments of the person in clothes that stand off by mean_m on average and swing in proportion, from
+    poses that are somewhat wrong."""
+    model, rng = fitter().model, np.random.default_rng(3)
+    ratio = thickness_per_movement(model)
+    swing = np.sin(np.arange(N_FRAMES) / N_FRAMES * 2 * np.pi) * np.sqrt(2)
+    out = []
+    for k, state in enumerate(true_states()):
+        normals = vertex_normals(state.template, model.faces)
+        off = covered() * mean_m * (1.0 + swing[k] / ratio)
+        worn = state.moved(template=state.template + off[:, None] * normals)
+        posed = fitter().posed(worn, fitter().joints(state.betas))
+        # The pose an alignment has is off; its template takes that up, so that the posed surface is right.
+        pose = state.pose + 0.02 * rng.normal(size=state.pose.shape)
+        joints = fitter().joints(state.betas)
+        start = BodyState(state.template, pose, state.translation, state.betas)
+        vertices, rotations, _ = fitter().linearised(start, joints)
+        template = state.template + np.linalg.solve(rotations, (posed - vertices)[:, :, None])[:, :, 0]
+        out.append(Alignment(k, start.moved(template=template), 0.03, 0.002))
+    return tuple(out)
+
+
+@cache
+def found(mean_m: float) -> tuple[Together, FusionShape, tuple[Alignment, ...]]:
+    together = fit_together(fitter(), finder(), clothed(mean_m), SETTINGS)
+    fusion, again = fused(fitter(), finder(), clothed(mean_m), SETTINGS)
+    return together, fusion, tuple(again)
+
+
+def error_mm(fusion: FusionShape, alignments: tuple[Alignment, ...]) -> np.ndarray:
+    """Signed errors of all frames' covered vertices, posed."""
+    rows = []
+    for alignment, true in zip(alignments, true_states(), strict=True):
+        state = alignment.state.moved(template=fusion.template)
+        surface = Surface(fitter().posed(state, fusion.joints), fitter().model.faces)
+        rows.append(signed_error_mm(fitter().posed(true), surface)[covered()])
+    return np.concatenate(rows)
+
+
+def test_the_thickness_of_swinging_clothes_is_found_and_bare_parts_have_none():
+    together = found(0.02)[0]
+    expected = together.thickness.expected
+    assert 0.012 < np.median(expected[covered()]) < 0.028
+    zero = true_states()[0].template
+    head = zero[:, 1] > 0.55
+    assert np.median(expected[head]) < 0.004
+    assert np.median(together.thickness.tolerance[head]) < np.median(together.thickness.tolerance[covered()])
+
+
+def test_the_body_lies_under_loose_clothes_and_on_bare_skin():
+    for mean_m, most_mm in ((0.0, 2.0), (0.02, 5.0)):
+        _, fusion, again = found(mean_m)
+        error = error_mm(fusion, again)
+        assert abs(error.mean()) < most_mm, f"{1e3 * mean_m:.0f} mm of cloth: bias {error.mean():+.1f} mm"
+
+
+def test_poses_get_nearer_to_the_truth_than_the_alignments_were():
+    _, fusion, again = found(0.0)
+    for alignment, first, true in zip(again, clothed(0.0), true_states(), strict=True):
+        joints = [
+            fitter().posed_joints(state, fitter().joints(state.betas))
+            for state in (alignment.state, first.state, true)
+        ]
+        now, before = (np.linalg.norm(j[:22] - joints[2][:22], axis=1).mean() for j in joints[:2])
+        assert now < 0.6 * before, f"{1e3 * now:.1f} mm, {1e3 * before:.1f} mm before"
+
+
+def test_realigning_keeps_the_posed_surfaces():
+    together, fusion, again = found(0.02)
+    for alignment, first in zip(again, clothed(0.02), strict=True):
+        posed = fitter().posed(alignment.state)
+        np.testing.assert_allclose(posed, fitter().posed(first.state), atol=1e-9)
+        np.testing.assert_allclose(alignment.state.betas, together.betas)
+    assert fusion.confidence is not None
+    assert 0.0 < fusion.confidence.min() <= fusion.confidence.max() <= 1.0
+
+
+def test_confidence_falls_where_clothes_are():
+    fusion = found(0.02)[1]
+    assert fusion.confidence is not None
+    assert np.median(fusion.confidence[covered()]) < 0.6 * np.median(fusion.confidence[~covered()])
+
+
+def test_energy_falls():
+    energies = found(0.0)[0].energies
+    assert len(energies) > 2
+    assert energies[-1] < 0.5 * energies[0]
+
+
+def test_few_frames_or_hulls_without_trust_keep_their_alignments():
+    few = list(clothed(0.0)[:3])
+    assert not can_be_together(few, 1.0)
+    assert not can_be_together(clothed(0.0), 0.2)
+    assert can_be_together(clothed(0.0), 1.0)
+    fusion, again = fused(fitter(), finder(), few, SETTINGS)
+    assert again == few
+    assert fusion.confidence is None
+    far = [replace(a, distance_m=0.012) for a in clothed(0.0)]
+    assert fused(fitter(), finder(), far, SETTINGS)[1] == far
+
+
+def test_suspect_frames_do_not_speak_for_the_shape():
+    alignments = [*clothed(0.0)[:5], replace(clothed(0.0)[5], status="suspect")]
+    assert [a.frame_id for a in usable(alignments)] == [0, 1, 2, 3, 4]
+    again = fused(fitter(), finder(), alignments, SETTINGS)[1]
+    assert again[5] is alignments[5]
+    assert again[0] is not alignments[0]
+
+
+def test_many_frames_share_the_shape_that_some_of_them_find():
+    settings = replace(SETTINGS, together=replace(SETTINGS.together, shape_frames=4))
+    together = fit_together(fitter(), finder(), clothed(0.0), settings)
+    assert together.poses.shape == (N_FRAMES, fitter().model.n_joints, 3)
+    for pose, state in zip(together.poses, true_states(), strict=True):
+        assert np.abs(pose - state.pose)[[0, 1, 2, 4, 5, 16, 17]].max() < 0.12
+
+
+def test_what_bending_does_is_not_cloth():
+    model = fitter().model
+    normals = vertex_normals(model.template, model.faces)
+    still = np.stack([finder().mean_pose()] * 4)
+    assert bending_noise(model, still, normals).max() < 1e-9
+    moving = still.copy()
+    moving[:, 4, 0] = [0.0, 0.6, 1.2, 1.8]
+    noise = bending_noise(model, moving, normals)
+    knee = model.weights[:, 4] > 0.3
+    assert noise[knee].max() > 0.002
+    assert noise[model.weights[:, 18] > 0.5].max() < 1e-6
+    offsets = noise * np.array([-1.2, -0.6, 0.6, 1.2])[:, None]
+    ratio = thickness_per_movement(model)
+    thickness = expected_thickness(offsets, noise, ratio, model.faces, SETTINGS.thickness)
+    np.testing.assert_allclose(thickness.expected, SETTINGS.thickness.thinnest_m, atol=1e-4)
+    more = expected_thickness(offsets, 0.0 * noise, ratio, model.faces, SETTINGS.thickness)
+    assert more.expected[knee].max() > 0.003
