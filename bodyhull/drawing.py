@@ -13,13 +13,14 @@ from tqdm import tqdm
 from bodyhull.carving import open_for, refuse_other_input
 from bodyhull.config import RunConfig, digest
 from bodyhull.errors import UserError
-from bodyhull.fitting import load_track
+from bodyhull.fitting import load_fusion, load_track
 from bodyhull.folder import RunFolder
 from capture.recording import Recording
 from hull.mesh_file import load_mesh
 from render.overlay import agreement_picture, body_surface, crop_around, intersection_over_union, overlay
 from render.report import Image, ReportData, Row, Table, write_report
 from render.scene import Renderer
+from render.shape_views import shape_views
 from render.video import write_video
 
 #: Frames and cameras that the contact sheet shows.
@@ -222,6 +223,7 @@ def write_run_report(config: RunConfig, recording: Recording, track: dict[str, A
             problems=tuple(problems),
             notes=recording.settled,
             facts=tuple(facts),
+            pictures=_shape_pictures(folder),
             tables=tuple(tables),
             sheet_headers=("picture", "silhouette", "hull", "body", "overlay", "agreement"),
             sheet=tuple(_contact_sheet(recording, folder, good)),
@@ -229,6 +231,29 @@ def write_run_report(config: RunConfig, recording: Recording, track: dict[str, A
         ),
     )
     folder.update_stage("render", report_key=report_key(folder))
+
+
+def _shape_pictures(folder: RunFolder) -> tuple[Image, ...]:
+    """The fusion shape coloured by what is known of the clothes; none where that could not be told."""
+    fusion = load_fusion(folder)
+    if fusion.thickness is None or fusion.confidence is None:
+        return ()
+    faces = load_track(folder)["faces"]
+    views = shape_views(
+        fusion.template,
+        faces,
+        [
+            ("cloth 0-40 mm", 1e3 * fusion.thickness.expected, 0.0, 40.0),
+            ("confidence 0-1", fusion.confidence, 0.0, 1.0),
+        ],
+    )
+    return (
+        Image(
+            views,
+            "The fusion shape. Above: how far the clothes stand away, as their movement tells. "
+            "Below: confidence in the place of the skin; 1: as well known as bare skin.",
+        ),
+    )
 
 
 def error_table(errors: dict[str, Any]) -> Table:

@@ -43,11 +43,16 @@ N_STEPS = 8
 
 @dataclass(frozen=True)
 class Figure:
-    """A posed body in a tile. azimuth: where it is seen from, rad, 0 is the front, positive its left."""
+    """A posed body in a tile.
+
+    azimuth: where it is seen from, rad, 0 is the front, positive its left; colours: RGB a vertex (V 3), else
+    skin.
+    """
 
     vertices: Float[np.ndarray, "v 3"]
     caption: str
     azimuth: float = 0.0
+    colours: UInt8[np.ndarray, "v 3"] | None = None
 
 
 def posed_body(
@@ -162,7 +167,8 @@ def _drawn(
     camera = Camera("turntable", size, intrinsics, pose, np.zeros(0))
     axes = pose[:3, :3].T
     lights = [Light(axes @ np.array(way), power) for way, power in LIGHTS]
-    drawn = Stage([Surface(figure.vertices, faces, colour=SKIN)], AMBIENT).colour(camera, lights)
+    surface = Surface(figure.vertices, faces, figure.colours, SKIN)
+    drawn = Stage([surface], AMBIENT).colour(camera, lights)
     uncovered = (255 - drawn.coverage.astype(np.float64))[:, :, None] / 255
     mixed = drawn.colour + uncovered * np.array(PAPER)
     return np.clip(np.round(mixed), 0, 255).astype(np.uint8)
