@@ -1,8 +1,8 @@
 """What the shape coefficients do to template and joints, prepared once so that many of them cost little.
 
 Betas move the template by S (3V, B), and posed vertices also through the joints: a bone's offset is linear in
-the joints, and a vertex follows at most four bones, so that part is K Q with a fixed K (3V, 3J) and a small Q
-(3J, B) a pose. E_cpl and the tether are quadratic in S; their matrices do not depend on the state.
+the joints by a small Q (3J, B) a pose. E_cpl and the tether are quadratic in S; their matrices do not depend
+on the state. Where S only steers an iteration it is kept in single precision: half the memory to read.
 """
 
 from __future__ import annotations
@@ -19,15 +19,17 @@ from fit.body.skeleton import axis_angle_to_matrix
 
 @dataclass(frozen=True)
 class ShapeOperators:
-    """shape: S (3V B); stiff_shape: (L kron I) S; shape_stiff_shape, shape_shape: S^T (L kron I) S and S^T S;
-    joint_shape: joints by betas (J 3 B); bone_spread: K (3V 3J); parents (J)."""
+    """shape: S (3V B); single_shape, single_stiff_shape: S and (L kron I) S in single precision;
+    shape_stiff_shape, shape_shape: S^T (L kron I) S and S^T S; joint_rest (J 3), joint_shape (J 3 B): joints
+    and their dependence on the betas; parents (J)."""
 
     shape: Float[np.ndarray, "w b"]
-    stiff_shape: Float[np.ndarray, "w b"]
+    single_shape: Float[np.ndarray, "w b"]
+    single_stiff_shape: Float[np.ndarray, "w b"]
     shape_stiff_shape: Float[np.ndarray, "b b"]
     shape_shape: Float[np.ndarray, "b b"]
+    joint_rest: Float[np.ndarray, "j 3"]
     joint_shape: Float[np.ndarray, "j 3 b"]
-    bone_spread: Float[np.ndarray, "w m"]
     parents: tuple[int, ...]
 
     @staticmethod
@@ -38,17 +40,19 @@ class ShapeOperators:
         stiff = np.ascontiguousarray((laplacian @ shape.reshape(n, -1)).reshape(3 * n, n_betas))
         return ShapeOperators(
             shape=shape,
-            stiff_shape=stiff,
+            single_shape=shape.astype(np.float32),
+            single_stiff_shape=stiff.astype(np.float32),
             shape_stiff_shape=shape.T @ stiff,
             shape_shape=shape.T @ shape,
+            joint_rest=model.joint_regressor @ model.template,
             joint_shape=np.einsum("jv,vcb->jcb", model.joint_regressor, model.shape_directions),
-            bone_spread=np.kron(model.weights, np.eye(3)),
             parents=tuple(int(p) for p in model.parents),
         )
 
     def pull(self, coupling: float, tether: float) -> Float[np.ndarray, "w b"]:
-        """(coupling L + tether) S: the pull on the template of a unit of each coefficient."""
-        return coupling * self.stiff_shape + tether * self.shape
+        """(coupling L + tether) S: the pull on the template of a unit of each coefficient (single
+        precision)."""
+        return np.float32(coupling) * self.single_stiff_shape + np.float32(tether) * self.single_shape
 
     def stiffness(self, coupling: float, tether: float) -> Float[np.ndarray, "b b"]:
         """S^T (coupling L + tether) S."""

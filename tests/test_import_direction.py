@@ -22,7 +22,7 @@ COMMON = {"numpy", "scipy", "jaxtyping", "tqdm"}
 LIBRARIES = {
     "capture": {"cv2", "pycolmap"},
     "hull": {"cv2", "skimage", "open3d", "numba"},
-    "fit": {"jax", "skimage", "open3d", "threadpoolctl", "platformdirs", "body_models"},
+    "fit": {"jax", "numba", "skimage", "open3d", "threadpoolctl", "platformdirs", "body_models"},
     "render": {"cv2", "open3d", "pyrender", "OpenGL", "av", "jinja2", "matplotlib"},
     "bodyhull": {"tyro", "jax", "av"},
 }
