@@ -20,6 +20,8 @@ from fit.solver import Fitter, Objective, ScanPoints, Unknowns, minimise
 from fit.state import BodyState
 from hull.scan import Scan
 
+#: So many points tell the pose; the template then takes all of them.
+POSE_POINTS = 12_000
 #: Alignments whose points stay this far away on average are marked: the pose is probably wrong.
 SUSPICIOUS_M = 0.03
 
@@ -59,6 +61,7 @@ def align_frame(
     All starts go through the pose-and-shape stage; the one with the lowest energy gets the template. joints:
     hold the skeleton fixed (J 3) instead of letting it follow the betas.
     """
+    thin = scan.thinned(POSE_POINTS)
     best: BodyState | None = None
     best_energy = np.inf
     for start in starts:
@@ -67,7 +70,7 @@ def align_frame(
         for weights in settings.align_pose:
             objective = Objective(
                 fitter,
-                scan,
+                thin,
                 weights,
                 Unknowns(template=False, n_betas=settings.pose_betas),
                 finder.prior.mean,
@@ -140,7 +143,7 @@ def _align_in_order(
             starts = starting_poses(finder, coarse, keypoints, previous, centroid, best_score)
             state = align_frame(fitter, finder, as_scan_points(scan), starts, settings)
             posed = fitter.posed(state)
-            distance = mean_distance(posed, fitter.model.faces, scan.points)
+            distance = mean_distance(fitter, posed, scan.points)
         except (FloatingPointError, np.linalg.LinAlgError) as error:
             rest = BodyState(
                 fitter.shaped(np.zeros(finder.n_model_betas)),
@@ -194,8 +197,6 @@ def starting_poses(
     return [at for at in starts if at.score < 1.25 * starts[0].score][:2]
 
 
-def mean_distance(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> float:
-    """Mean unsigned distance of points to a mesh, m."""
-    from fit.closest import closest_points
-
-    return float(np.abs(closest_points(vertices, faces, points).distance).mean())
+def mean_distance(fitter: Fitter, posed: np.ndarray, points: np.ndarray) -> float:
+    """Mean unsigned distance of points to a posed body, m."""
+    return float(np.abs(fitter.surface.closest(posed, points).distance).mean())

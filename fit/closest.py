@@ -7,7 +7,7 @@ in float64, so that residuals and their derivatives agree to full precision.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -136,6 +136,40 @@ class Container:
         return ClosestPoints(
             triangle_idx, bary, foot, normals, np.where(contact, along, sign * distance), direction
         )
+
+
+@dataclass(frozen=True)
+class Depths:
+    """How far vertices stand out of a container, step after step: only those are looked up that may.
+
+    A distance changes no faster than its vertex moves, so one that was deep inside needs no search until it
+    has come as far. distance (V): signed, m, positive outside; for a vertex that cannot be near, a bound from
+    above. closest: where each vertex was looked up last, at looked_up (V 3).
+    """
+
+    container: Container
+    looked_up: Float[np.ndarray, "v 3"]
+    closest: ClosestPoints
+    distance: Float[np.ndarray, "v"]
+
+    @staticmethod
+    def of(container: Container, vertices: Float[np.ndarray, "v 3"]) -> Depths:
+        """Look up all."""
+        closest = container.closest(vertices)
+        return Depths(container, vertices, closest, closest.distance)
+
+    def after(self, vertices: Float[np.ndarray, "v 3"], margin_m: float) -> Depths:
+        """The depths of moved vertices, exact for all that are not deeper than the margin."""
+        bound = self.closest.distance + np.linalg.norm(vertices - self.looked_up, axis=1)
+        near = np.flatnonzero(bound > -margin_m)
+        found = self.container.closest(vertices[near])
+        merged = {}
+        for field in fields(ClosestPoints):
+            merged[field.name] = getattr(self.closest, field.name).copy()
+            merged[field.name][near] = getattr(found, field.name)
+        looked_up, distance = self.looked_up.copy(), bound
+        looked_up[near], distance[near] = vertices[near], found.distance
+        return Depths(self.container, looked_up, ClosestPoints(**merged), distance)
 
 
 def closest_points(

@@ -298,3 +298,28 @@ def gathered_columns(ptr, joint, blocks, columns, on_pose, on_shift):
                 x, y, z = blocks[n, 0, e], blocks[n, 1, e], blocks[n, 2, e]
                 for b in range(n_columns):
                     on_pose[row, b] += x * columns[v, 0, b] + y * columns[v, 1, b] + z * columns[v, 2, b]
+
+
+def _loose_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Sums may be taken in any order: for what only steers an iteration."""
+    try:
+        return njit(cache=True, nogil=True, error_model="numpy", fastmath=True)(function)
+    except RuntimeError:
+        return njit(nogil=True, error_model="numpy", fastmath=True)(function)
+
+
+@_loose_kernel
+@no_type_check
+def both_ways(matrix, right, left, product, transposed):
+    """product (W) = matrix right and transposed (B) = matrix^T left, reading the matrix (W B) once."""
+    n = matrix.shape[1]
+    for b in range(n):
+        transposed[b] = 0.0
+    for row in range(matrix.shape[0]):
+        total = np.float32(0.0)
+        x = left[row]
+        for b in range(n):
+            m = matrix[row, b]
+            total += m * right[b]
+            transposed[b] += m * x
+        product[row] = total

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from fit.closest import ClosestPoints
 
-TRIANGLES_A_LEAF = 4
+TRIANGLES_A_LEAF = 2
 
 
 @dataclass(frozen=True)

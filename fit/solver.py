@@ -6,16 +6,16 @@ how many points the scan has; steps.py solves them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.sparse import csr_matrix
 
 from fit import energy as terms
 from fit.articulation import Articulation, PosedBody
 from fit.body.model import BodyModel
-from fit.closest import ClosestPoints, Container
+from fit.closest import ClosestPoints, Container, Depths
 from fit.mesh_blocks import MeshEdges, sum_over_points
 from fit.moving_mesh import MovingMesh
 from fit.normal_equations import edge_laplacian
@@ -38,6 +38,14 @@ class ScanPoints:
     normals: Float[np.ndarray, "n 3"]
     weight: Float[np.ndarray, "n"]
     is_skin: np.ndarray
+
+    def thinned(self, most: int) -> ScanPoints:
+        """Every so many-th point, so that about `most` are left: the points are even in area in any
+        order."""
+        stride = max(1, len(self.points) // most)
+        return ScanPoints(
+            self.points[::stride], self.normals[::stride], self.weight[::stride], self.is_skin[::stride]
+        )
 
 
 @dataclass(frozen=True)
@@ -150,16 +158,20 @@ class Objective:
     container: Container | None = None
 
     def container_terms(
-        self, vertices: Float[np.ndarray, "v 3"]
-    ) -> tuple[float, ClosestPoints, Float[np.ndarray, "v"]] | None:
-        """E_inside: vertices outside a closed scan (a visual hull contains the person) are drawn in."""
+        self, vertices: Float[np.ndarray, "v 3"], before: Depths | None = None
+    ) -> tuple[float, Depths, Float[np.ndarray, "v"], Float[np.ndarray, "v"]] | None:
+        """E_inside: vertices outside a closed scan (a visual hull contains the person) are drawn in.
+
+        Returns energy, depths, and pull and weight a vertex; before: the depths at a state close by.
+        """
         if self.container is None or self.weights.inside == 0.0:
             return None
-        closest = self.container.closest(vertices)
-        depth = closest.distance + self.weights.margin_m
-        energy, weight = terms.huber(depth, self.weights.inside_m)
-        scale = self.weights.inside * (depth > 0)
-        return float((scale * energy).sum()), replace(closest, distance=depth), scale * weight
+        margin = self.weights.margin_m
+        depths = Depths.of(self.container, vertices) if before is None else before.after(vertices, margin)
+        beyond = depths.distance + margin
+        energy, weight = terms.huber(beyond, self.weights.inside_m)
+        scale = self.weights.inside * (beyond > 0)
+        return float((scale * energy).sum()), depths, scale * weight * beyond, scale * weight
 
     def point_terms(self, closest: ClosestPoints) -> terms.PerPoint:
         """Energy and weight of every scan point: skin, or outside + fit."""
@@ -193,10 +205,11 @@ class Objective:
 
     def prior_energy(self, state: BodyState) -> float:
         """E_cpl, tether and E_prior with their weights."""
-        w = self.weights
-        difference = self.difference(state)
-        total = w.coupling * terms.coupling(difference, self.fitter.laplacian)[0]
-        total += w.tether * terms.tether(difference)[0]
+        w, total = self.weights, 0.0
+        if w.coupling or w.tether:
+            difference = self.difference(state)
+            total += w.coupling * terms.coupling(difference, self.fitter.laplacian)[0]
+            total += w.tether * terms.tether(difference)[0]
         total += (
             w.pose_prior
             * terms.gaussian_prior(state.pose[1:].ravel(), self.pose_mean, self.pose_precision)[0]
@@ -204,20 +217,21 @@ class Objective:
         total += w.shape_prior * float(state.betas @ state.betas)
         return total
 
-    def linearise(self, state: BodyState, nearest: Int[np.ndarray, "n"] | None = None) -> Linearised:
-        """Energy and Gauss-Newton quantities at a state; nearest: the points' triangles at a state close
-        by."""
+    def linearise(self, state: BodyState, before: Linearised | None = None) -> Linearised:
+        """Energy and Gauss-Newton quantities at a state; before: those at a state close by."""
         body = self.fitter.body(state, self.joints)
+        nearest = None if before is None else before.nearest
         closest = self.fitter.surface.closest(body.vertices, self.scan.points, nearest)
         point_energy, weight = self.point_terms(closest)
         matrix, rhs = sum_over_points(self.fitter.mesh, closest, weight)
-        energy = float(point_energy.sum()) + self.prior_energy(state)
-        held = self.container_terms(body.vertices)
+        energy, depths = float(point_energy.sum()) + self.prior_energy(state), None
+        held = self.container_terms(body.vertices, None if before is None else before.depths)
         if held is not None:
-            energy += held[0]
-            matrix = matrix.with_vertex_blocks(held[2], held[1].direction)
-            rhs = rhs - (held[2] * held[1].distance)[:, None] * held[1].direction
-        return Linearised(energy, matrix, rhs, body, closest.triangle_idx)
+            inside, depths, pull, hold = held
+            energy += inside
+            matrix = matrix.with_vertex_blocks(hold, depths.closest.direction)
+            rhs = rhs - pull[:, None] * depths.closest.direction
+        return Linearised(energy, matrix, rhs, body, closest.triangle_idx, depths)
 
     def energy(self, state: BodyState) -> float:
         """E alone."""
@@ -270,7 +284,7 @@ def minimise(
         small = 0
         for _ in range(max_iterations):
             trial = objective.moved(state, *steps(lin, state, damping))
-            trial_lin = objective.linearise(trial, lin.nearest)
+            trial_lin = objective.linearise(trial, lin)
             if trial_lin.energy < energies[-1]:
                 drop = (energies[-1] - trial_lin.energy) / max(energies[-1], 1e-30)
                 state, lin = trial, trial_lin

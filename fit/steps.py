@@ -22,6 +22,7 @@ from scipy.sparse.linalg import splu
 
 from fit import energy as terms
 from fit.articulation import PosedBody
+from fit.closest import Depths
 from fit.mesh_blocks import MeshMatrix
 from fit.state import BodyState
 
@@ -37,13 +38,15 @@ STEPS_A_FACTOR = 3
 @dataclass(frozen=True)
 class Linearised:
     """An objective at a state: energy; data term's matrix and right-hand side (V 3) over posed vertices; the
-    posed body with its derivatives; nearest (N): the triangle of every point."""
+    posed body with its derivatives; nearest (N): the triangle of every point; depths: of the vertices in a
+    container."""
 
     energy: float
     matrix: MeshMatrix
     rhs: Float[np.ndarray, "v 3"]
     body: PosedBody
     nearest: Int[np.ndarray, "n"]
+    depths: Depths | None
 
 
 class Steps:
@@ -63,7 +66,7 @@ class Steps:
         self.coupled = self.n_betas > 0 and objective.target is None
         self.jointed = self.n_betas > 0 and objective.joints is None
         self._pull = (
-            fitter.shape.pull(weights.coupling, weights.tether)[:, : self.n_betas]
+            np.ascontiguousarray(fitter.shape.pull(weights.coupling, weights.tether)[:, : self.n_betas])
             if self.coupled and unknowns.template
             else None
         )
@@ -208,8 +211,12 @@ class Steps:
             compiled_skin.add_coupling(fitter.mesh.edges, strength, w.tether, xt, out_t)
             out_p = hessian @ xp + narrowed(*others)
             if shape_pull is not None:
-                out_t -= (shape_pull @ betas.astype(np.float32)).reshape(n, 3)
-                out_p[n_columns:] -= shape_pull.T @ xt.ravel().astype(np.float32)
+                from_betas, on_betas = np.empty(3 * n, np.float32), np.empty(n_betas, np.float32)
+                compiled_skin.both_ways(
+                    shape_pull, betas.astype(np.float32), xt.ravel().astype(np.float32), from_betas, on_betas
+                )
+                out_t -= from_betas.reshape(n, 3)
+                out_p[n_columns:] -= on_betas
             return np.concatenate([out_t.ravel(), out_p])
 
         def precondition(r: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fit.align import Alignment, as_scan_points, mean_distance
-from fit.closest import Container
+from fit.closest import Container, Depths
 from fit.fuse import FusionShape
 from fit.initialise import PoseFinder
 from fit.settings import FitSettings
@@ -90,20 +90,21 @@ def held_inside(fitter: Fitter, fusion: FusionShape, state: BodyState, container
     are left alone.
     """
     faces = fitter.model.faces
+    depths: Depths | None = None
     for round_idx in range(HOLD_ROUNDS):
-        vertices, rotations, _ = fitter.linearised(state, fusion.joints)
-        closest = container.closest(vertices)
-        beyond = (closest.distance > 0) & (closest.distance < REACH_M)
+        body = fitter.body(state, fusion.joints)
+        depths = Depths.of(container, body.vertices) if depths is None else depths.after(body.vertices, 0.0)
+        beyond = (depths.distance > 0) & (depths.distance < REACH_M)
         if not beyond.any():
             break
-        depth = np.where(beyond, closest.distance + SKIN_DEPTH_M, 0.0)
-        move = -depth[:, None] * closest.direction
+        depth = np.where(beyond, depths.distance + SKIN_DEPTH_M, 0.0)
+        move = -depth[:, None] * depths.closest.direction
         if round_idx < HOLD_ROUNDS - 2:  # at first softly, so that no dent stands alone; at last exactly
             shared = [smoothed_over_mesh(move[:, axis], faces, 2) for axis in range(3)]
             share = smoothed_over_mesh(beyond.astype(float), faces, 2)
             move = np.where(beyond[:, None], move, np.stack(shared, axis=1) / np.maximum(share, 0.3)[:, None])
         # The blended rotations turn template moves into posed ones; solve for the template's.
-        step = np.linalg.solve(rotations, move[:, :, None])[:, :, 0]
+        step = np.linalg.solve(body.rotations, move[:, :, None])[:, :, 0]
         state = state.moved(template=state.template + step)
     return state
 
@@ -131,7 +132,7 @@ def track_sequence(
             try:
                 container = container_of(alignment.frame_id)
                 state = track_frame(fitter, finder, fusion, alignment, scan, settings, container)
-                distance = mean_distance(fitter.posed(state, fusion.joints), fitter.model.faces, scan.points)
+                distance = mean_distance(fitter, fitter.posed(state, fusion.joints), scan.points)
                 frame = TrackedFrame(alignment.frame_id, state, distance, alignment.status, alignment.message)
             except (FloatingPointError, np.linalg.LinAlgError) as error:
                 frame = TrackedFrame(

@@ -5,7 +5,7 @@ import pytest
 
 from fit.articulation import Articulation, PosedBody
 from fit.body.model import BodyModel, load_body
-from fit.closest import closest_points
+from fit.closest import Container, Depths, closest_points
 from fit.mesh_blocks import MeshEdges, sum_over_points
 from fit.moving_mesh import MovingMesh
 from fit.normal_equations import MeshPattern, accumulate, edge_laplacian
@@ -156,3 +156,20 @@ def test_coupling_on_edges_is_the_laplacian(model: BodyModel, random: np.random.
     difference, out = random.normal(size=(6890, 3)), np.zeros((6890, 3))
     add_coupling(edges.edges, 2.0 * edges.strength, 0.3, difference, out)
     np.testing.assert_allclose(out, 2.0 * (laplacian @ difference) + 0.3 * difference, atol=1e-11)
+
+
+def test_depths_after_a_move_are_those_of_a_full_search(
+    model: BodyModel, random: np.random.Generator
+) -> None:
+    container = Container.of(1.02 * model.template, model.faces)
+    vertices, margin = model.template, 0.0005
+    depths = Depths.of(container, vertices)
+    for _ in range(4):
+        vertices = vertices + 0.004 * random.normal(size=vertices.shape)
+        depths = depths.after(vertices, margin)
+        full = container.closest(vertices)
+        near = full.distance > -margin
+        assert 50 < near.sum() < 5000
+        np.testing.assert_array_equal(depths.distance[near], full.distance[near])
+        np.testing.assert_array_equal(depths.closest.direction[near], full.direction[near])
+        assert (depths.distance[~near] <= -margin).all()

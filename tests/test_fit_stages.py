@@ -197,4 +197,4 @@ def test_the_papers_measure_takes_the_pose_out():
     reposed = pose_truth_to(true, faces, scored, rig, result)
     paper = np.abs(signed_error_mm(reposed, result)).mean()
     assert paper < 0.25 * direct, f"{paper:.2f} of {direct:.2f} mm are left"
-    assert mean_distance(true, faces, true) < 1e-6
+    assert mean_distance(fitter(), true, true) < 1e-6
