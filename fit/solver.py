@@ -6,7 +6,7 @@ how many points the scan has; steps.py solves them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -27,6 +27,10 @@ from fit.surface import vertex_normals
 
 #: Radians: a joint that turns farther in one step has left the region where the linearisation means anything.
 LARGEST_ROTATION = 0.5
+#: Side of the cubes by which points are sorted for the search.
+CELL_M = 0.03
+#: More points than twice these first come to rest on so many of them.
+FIRST_POINTS = 60_000
 
 
 @dataclass(frozen=True)
@@ -39,13 +43,26 @@ class ScanPoints:
     weight: Float[np.ndarray, "n"]
     is_skin: np.ndarray
 
+    def chosen(self, idx: Int[np.ndarray, "m"] | slice) -> ScanPoints:
+        """These points, in this order."""
+        return ScanPoints(**{f.name: getattr(self, f.name)[idx] for f in fields(self)})
+
+    def cell_by_cell(self) -> ScanPoints:
+        """The same points, those of one small cube of space after those of another."""
+        if not np.isfinite(self.points).all():
+            return self
+        cell = ((self.points - self.points.min(0)) / CELL_M).astype(np.int64)
+        n = cell.max(0) + 1
+        return self.chosen(np.argsort((cell[:, 0] * n[1] + cell[:, 1]) * n[2] + cell[:, 2], kind="stable"))
+
+    def drawn(self, about: int) -> ScanPoints:
+        """About so many of the points, drawn at random (the same ones every time)."""
+        kept = np.random.default_rng(0).random(len(self.points)) * len(self.points) < about
+        return self.chosen(np.flatnonzero(kept))
+
     def thinned(self, most: int) -> ScanPoints:
-        """Every so many-th point, so that about `most` are left: the points are even in area in any
-        order."""
-        stride = max(1, len(self.points) // most)
-        return ScanPoints(
-            self.points[::stride], self.normals[::stride], self.weight[::stride], self.is_skin[::stride]
-        )
+        """Every so many-th point, so that about `most` are left: the points of a scan are even in area."""
+        return self.chosen(slice(None, None, max(1, len(self.points) // most)))
 
 
 @dataclass(frozen=True)
@@ -199,15 +216,16 @@ class Objective:
         return scale * energy, scale * weight
 
     def difference(self, state: BodyState) -> Float[np.ndarray, "v 3"]:
-        """T_Est minus what it is coupled to."""
+        """T_Est minus what it is coupled to; zeros where nothing is."""
+        if not (self.weights.coupling or self.weights.tether):
+            return np.zeros_like(state.template)
         target = self.fitter.shaped(state.betas) if self.target is None else self.target
         return state.template - target
 
-    def prior_energy(self, state: BodyState) -> float:
-        """E_cpl, tether and E_prior with their weights."""
+    def prior_energy(self, state: BodyState, difference: Float[np.ndarray, "v 3"]) -> float:
+        """E_cpl, tether and E_prior with their weights; difference: `difference` of the state."""
         w, total = self.weights, 0.0
         if w.coupling or w.tether:
-            difference = self.difference(state)
             total += w.coupling * terms.coupling(difference, self.fitter.laplacian)[0]
             total += w.tether * terms.tether(difference)[0]
         total += (
@@ -224,14 +242,15 @@ class Objective:
         closest = self.fitter.surface.closest(body.vertices, self.scan.points, nearest)
         point_energy, weight = self.point_terms(closest)
         matrix, rhs = sum_over_points(self.fitter.mesh, closest, weight)
-        energy, depths = float(point_energy.sum()) + self.prior_energy(state), None
+        difference = self.difference(state)
+        energy, depths = float(point_energy.sum()) + self.prior_energy(state, difference), None
         held = self.container_terms(body.vertices, None if before is None else before.depths)
         if held is not None:
             inside, depths, pull, hold = held
             energy += inside
             matrix = matrix.with_vertex_blocks(hold, depths.closest.direction)
             rhs = rhs - pull[:, None] * depths.closest.direction
-        return Linearised(energy, matrix, rhs, body, closest.triangle_idx, depths)
+        return Linearised(energy, matrix, rhs, body, difference, closest.triangle_idx, depths)
 
     def energy(self, state: BodyState) -> float:
         """E alone."""
@@ -239,7 +258,9 @@ class Objective:
         closest = self.fitter.surface.closest(vertices, self.scan.points)
         held = self.container_terms(vertices)
         return (
-            float(self.point_terms(closest)[0].sum()) + self.prior_energy(state) + (held[0] if held else 0.0)
+            float(self.point_terms(closest)[0].sum())
+            + self.prior_energy(state, self.difference(state))
+            + (held[0] if held else 0.0)
         )
 
     def moved(
@@ -270,12 +291,18 @@ def minimise(
 ) -> Outcome:
     """Levenberg-Marquardt: a step that raises the energy is taken back and damped more.
 
-    Raises FloatingPointError when the energy is not finite at the start (NaN in scan or state).
+    Of very many points (the union of hundreds of frames) some are taken first, then all. Raises
+    FloatingPointError when the energy is not finite at the start (NaN in scan or state).
     """
     from threadpoolctl import threadpool_limits
 
+    if len(objective.scan.points) > 2 * FIRST_POINTS:
+        fewer = replace(objective, scan=objective.scan.drawn(FIRST_POINTS))
+        state = minimise(fewer, state, max_iterations, relative_drop).state
     # Two thread pools fighting for the same cores cost a factor of two to seven: BLAS keeps to one.
     with threadpool_limits(limits=1, user_api="blas"):
+        # Neighbours one after the other find what they need of the body in the processor's cache.
+        objective = replace(objective, scan=objective.scan.cell_by_cell())
         steps, lin = Steps(objective), objective.linearise(state)
         if not np.isfinite(lin.energy):
             raise FloatingPointError("the objective is not finite at the start: check the scan for NaN")

@@ -38,13 +38,14 @@ STEPS_A_FACTOR = 3
 @dataclass(frozen=True)
 class Linearised:
     """An objective at a state: energy; data term's matrix and right-hand side (V 3) over posed vertices; the
-    posed body with its derivatives; nearest (N): the triangle of every point; depths: of the vertices in a
-    container."""
+    posed body with its derivatives; difference (V 3): of template and target; nearest (N): the triangle of
+    every point; depths: of the vertices in a container."""
 
     energy: float
     matrix: MeshMatrix
     rhs: Float[np.ndarray, "v 3"]
     body: PosedBody
+    difference: Float[np.ndarray, "v 3"]
     nearest: Int[np.ndarray, "n"]
     depths: Depths | None
 
@@ -185,9 +186,8 @@ class Steps:
             hessian[n_columns:, n_columns:] += fitter.shape.stiffness(w.coupling, w.tether)[
                 :n_betas, :n_betas
             ]
-        difference = self.objective.difference(state)
-        pulled = np.zeros_like(difference)
-        compiled_skin.add_coupling(fitter.mesh.edges, strength, w.tether, difference, pulled)
+        pulled = np.zeros_like(lin.difference)
+        compiled_skin.add_coupling(fitter.mesh.edges, strength, w.tether, lin.difference, pulled)
         on_template, *on_others = body.gathered(lin.rhs)
         rhs_template = on_template - pulled
         rhs_parameters += narrowed(*on_others)

@@ -9,6 +9,7 @@ from fit.closest import Container, Depths, closest_points
 from fit.mesh_blocks import MeshEdges, sum_over_points
 from fit.moving_mesh import MovingMesh
 from fit.normal_equations import MeshPattern, accumulate, edge_laplacian
+from fit.solver import ScanPoints
 
 
 @pytest.fixture(scope="module")
@@ -173,3 +174,14 @@ def test_depths_after_a_move_are_those_of_a_full_search(
         np.testing.assert_array_equal(depths.distance[near], full.distance[near])
         np.testing.assert_array_equal(depths.closest.direction[near], full.direction[near])
         assert (depths.distance[~near] <= -margin).all()
+
+
+def test_sorting_and_drawing_points_keep_what_belongs_together(random: np.random.Generator) -> None:
+    points = random.normal(size=(5000, 3))
+    scan = ScanPoints(points, -points, points[:, 0], points[:, 1] > 0)
+    for found, n in ((scan.cell_by_cell(), 5000), (scan.drawn(500), None), (scan.thinned(500), 500)):
+        np.testing.assert_array_equal(found.normals, -found.points)
+        np.testing.assert_array_equal(found.weight, found.points[:, 0])
+        np.testing.assert_array_equal(found.is_skin, found.points[:, 1] > 0)
+        assert len(found.points) == n or 400 < len(found.points) < 600
+    np.testing.assert_array_equal(np.sort(scan.cell_by_cell().weight), np.sort(scan.weight))
