@@ -42,6 +42,7 @@ from hull.rays import RayScene
 from hull.ridges import raise_ridges
 from hull.surface import cross_exactly
 from hull.tables import SilhouetteTable, prepare_tables
+from hull.thin_parts import FINE_ENOUGH_M, with_thin_parts
 from hull.visual_hull import HullOptions, build_hull, grid_over
 from hull.witnesses import witness_rule
 
@@ -180,12 +181,17 @@ def refined_mesh(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and faces as `build_hull` makes them, without the search for faults and vertices' facts."""
     bounds = bounds_from_tables(tables) if bounds is None else bounds
-    grid = grid_over(bounds, voxel_m)
-    surface = binary_surface(carve(tables, witness_rule(tables, bounds.centre), grid))
-    culling = Culling(tables, grid)
+    grid, rule = grid_over(bounds, voxel_m), witness_rule(tables, bounds.centre)
+    culling, finely = Culling(tables, grid), voxel_m > FINE_ENOUGH_M
+    surface = binary_surface(carve(tables, rule, grid))
+    if finely:
+        surface, grid = with_thin_parts(surface, grid, culling, rule)
     crossings = cross_exactly(surface, grid, tables, culling)
     normals = vertex_normals(crossings.vertices, surface.faces, n_rings=1)
-    crossings, faces = raise_ridges(crossings, surface.faces, normals, tables, voxel_m, culling)
+    cell_m = grid.voxel_m * np.abs(surface.outer - surface.inner).sum(axis=1)
+    crossings, faces = raise_ridges(
+        crossings, surface.faces, normals, tables, cell_m, culling, valleys=finely
+    )
     kept, faces, _ = keep_what_matters(crossings.vertices, faces, tables)
     vertices = crossings.vertices[kept]
     assert is_closed(faces, len(vertices))

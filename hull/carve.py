@@ -206,6 +206,33 @@ def possible_witnesses(
     return found[:nx, :ny, :nz]
 
 
+def cells_in_question(
+    tables: Sequence[SilhouetteTable],
+    rule: WitnessRule,
+    grid: Grid,
+    cells: Int[np.ndarray, "3 n"],
+    side: int,
+    votes: int,
+) -> Bool[np.ndarray, " n"]:
+    """(N,) which cells, `side` voxels wide and counted in their own size, cameras that are asked about the
+    whole of them leave in question: nothing of the hull's surface lies in the others."""
+    n, full = cells.shape[1], rule.full()
+    front = _Front(
+        np.ascontiguousarray(cells, dtype=np.int32),
+        np.repeat(full[:, None], n, axis=1),
+        np.zeros((len(full), n), dtype=np.uint64),
+        np.zeros(n, dtype=np.uint8),
+    )
+    alive, half_m, order = np.ones(n, dtype=bool), 0.5 * side * grid.voxel_m, list(range(len(tables)))
+    asked = _ask(tables, rule, front, front.cells, alive, grid, side, half_m, votes, order)
+    left = asked.cells[:, asked.unasked.any(axis=0)]
+    if not left.shape[1]:
+        return np.zeros(n, dtype=bool)
+    low = cells.min(axis=1)[:, None]
+    shape = np.ptp(cells, axis=1) + 1
+    return np.isin(*(np.ravel_multi_index(tuple(each - low), shape) for each in (cells, left)))
+
+
 def _first_front(rule: WitnessRule, n: Sequence[int]) -> _Front:
     cells = np.stack(np.meshgrid(*[np.arange(k, dtype=np.int32) for k in n], indexing="ij")).reshape(3, -1)
     full = rule.full()

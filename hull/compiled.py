@@ -44,6 +44,7 @@ _N_FALSE_POSITIONS = 3
 # As in `hull.tables`; a test holds them together.
 INSIDE, OUTSIDE, NO_EVIDENCE, UNDECIDED = 1, 2, 4, 7
 FIRST_OUTLINE_BLOCK = 8
+DEEP, HIGH = 1, 2
 
 
 def _kernel(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -393,25 +394,79 @@ def exits(numbers, projections, origin, along, block, ends, who, exit_at, cut_by
 
 @_kernel
 @no_type_check
-def refused(numbers, projections, places, first, second, block, ends, who, votes, result):
-    """`result` (N, all false): whether at least `votes` tables see a place outside. `first`, `second` (N,):
-    tables (or -1) that are asked before the others, where one vote is enough."""
-    for i in range(len(result)):
+def refuser(numbers, projections, x, y, z, first, second, from_, to, who, votes):
+    """The table that is the `votes`-th to see a place outside, or -1. `first`, `second`: tables (or -1) that
+    are asked before `who` from `from_` to `to`, where one vote is enough."""
+    if votes == 1:
+        if first >= 0 and _refuses(numbers, projections, first, x, y, z):
+            return first
+        if second >= 0 and second != first and _refuses(numbers, projections, second, x, y, z):
+            return second
+    left = votes
+    for j in range(from_, to):
+        if _refuses(numbers, projections, who[j], x, y, z):
+            left -= 1
+            if left == 0:
+                return who[j]
+    return -1
+
+
+@_kernel
+@no_type_check
+def edge_kinds(
+    numbers, projections, middle, way, up_m, down_m, far_m, first, second, block, ends, who, votes, high, kind
+):
+    """`hull.ridges.edge_kinds`: `kind` (N, all 0). `high`: whether those are looked for."""
+    for i in range(len(kind)):
+        a, b, from_, to = np.int64(first[i]), np.int64(second[i]), ends[block[i]], ends[block[i] + 1]
+        x_0, y_0, z_0 = middle[0, i], middle[1, i], middle[2, i]
+        dx, dy, dz = way[0, i], way[1, i], way[2, i]
+        up, down = up_m[i], down_m[i]
+        x, y, z = x_0 + up * dx, y_0 + up * dy, z_0 + up * dz
+        by = refuser(numbers, projections, x, y, z, a, b, from_, to, who, votes)
+        if by < 0:
+            kind[i] = DEEP
+            continue
+        if not high:
+            continue
+        x, y, z = x_0 - down * dx, y_0 - down * dy, z_0 - down * dz
+        if votes > 1:
+            above = refuser(numbers, projections, x, y, z, a, b, from_, to, who, votes) >= 0
+        else:
+            above = (
+                _refuses(numbers, projections, by, x, y, z)
+                or (a >= 0 and a != by and _refuses(numbers, projections, a, x, y, z))
+                or (b >= 0 and b != by and _refuses(numbers, projections, b, x, y, z))
+            )
+        if above:
+            x, y, z = x_0 - far_m * dx, y_0 - far_m * dy, z_0 - far_m * dz
+            if refuser(numbers, projections, x, y, z, a, b, from_, to, who, votes) < 0:
+                kind[i] = HIGH
+
+
+@_kernel
+@no_type_check
+def witnesses(numbers, projections, places, block, answers, votes, sets, alive):
+    """For `hull.thin_parts`: `alive` (N, all true) gets false where at least `votes` tables see a place
+    outside; `sets` (W N, empty) the tables that see one inside, where alive. answers (C B): what every table
+    says of every block."""
+    for i in range(len(alive)):
         x, y, z = places[0, i], places[1, i], places[2, i]
-        if votes == 1:
-            a, b = first[i], second[i]
-            if (a >= 0 and _refuses(numbers, projections, a, x, y, z)) or (
-                b >= 0 and b != a and _refuses(numbers, projections, b, x, y, z)
-            ):
-                result[i] = True
-                continue
         left = votes
-        for j in range(ends[block[i]], ends[block[i] + 1]):
-            k = who[j]
-            if _refuses(numbers, projections, k, x, y, z):
+        for k in range(len(numbers)):
+            answer = answers[k, block[i]]
+            if answer == NO_EVIDENCE:
+                continue
+            if answer != INSIDE and answer != OUTSIDE:
+                answer, value = _ask_point(numbers, projections, k, x, y, z)
+                if answer == UNDECIDED:
+                    answer = INSIDE if value >= 0.5 else OUTSIDE
+            if answer == INSIDE:
+                sets[k >> 6, i] |= np.uint64(1) << np.uint64(k & 63)
+            elif answer == OUTSIDE:
                 left -= 1
                 if left == 0:
-                    result[i] = True
+                    alive[i] = False
                     break
 
 
@@ -442,29 +497,3 @@ def outlines(
                 n_found += 1
         n_witnesses[i], n_bounding[i] = seen, bounding
     return n_found, n
-
-
-@_kernel
-@no_type_check
-def picture_box(image):
-    """(x, y, width, height) of the pixels that are not 0, as `cv2.boundingRect` has it; all 0 without any."""
-    height, width = image.shape
-    top, bottom, left, right = height, -1, width, -1
-    for y in range(height):
-        any_bits = np.uint8(0)
-        for x in range(width):
-            any_bits |= image[y, x]
-        if any_bits == 0:
-            continue
-        top, bottom = min(top, y), y
-        for x in range(left):
-            if image[y, x]:
-                left = x
-                break
-        for x in range(width - 1, right, -1):
-            if image[y, x]:
-                right = x
-                break
-    if bottom < 0:
-        return 0, 0, 0, 0
-    return left, top, right + 1 - left, bottom + 1 - top

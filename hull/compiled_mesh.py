@@ -1,5 +1,6 @@
 """The loops over a mesh that numpy needs many passes for, compiled: the same operations in the same order as
 the plain definitions in `hull.cleaning`, `hull.slack` and `hull.ridges`, so the same results to the last bit.
+And the box around a picture's person.
 
 Compiled and kept as in `hull.compiled`.
 """
@@ -138,10 +139,10 @@ def spread_to_neighbours(values, faces, n_rounds):
 
 @_kernel
 @no_type_check
-def edge_middles(vertices, normals, faces, voxel_m, depth, least_length, a_of, b_of, middle, way, place):
+def edge_middles(vertices, normals, faces, least_length, a_of, b_of, middle, way):
     """For `hull.ridges`: the rising edges (a, b) of a closed surface whose ends look the same way about, in
-    the order of their corners; their middles (3 N), the ways (3 N, a voxel long) outward, and the places
-    (3 N) at that `depth` outside. How many they are; the arrays have room for more."""
+    the order of their corners; their middles (3 N) and the unit ways (3 N) outward. How many they are; the
+    arrays have room for more."""
     n = 0
     for k in range(3):
         for f in range(len(faces)):
@@ -156,11 +157,10 @@ def edge_middles(vertices, normals, faces, voxel_m, depth, least_length, a_of, b
             length = np.sqrt((x * x + y * y) + z * z)
             if not length > least_length:
                 continue
-            scale = voxel_m / max(length, 1e-30)
+            scale = 1.0 / max(length, 1e-30)
             way[0, n], way[1, n], way[2, n] = x * scale, y * scale, z * scale
             for axis in range(3):
                 middle[axis, n] = 0.5 * (vertices[a, axis] + vertices[b, axis])
-                place[axis, n] = middle[axis, n] + depth * way[axis, n]
             a_of[n], b_of[n] = a, b
             n += 1
     return n
@@ -261,3 +261,29 @@ def piece_volumes(vertices, faces, label, middle, n_pieces):
             (ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz)) + az * (bx * cy - by * cx)
         ) / 6.0
     return volume
+
+
+@_kernel
+@no_type_check
+def picture_box(image):
+    """(x, y, width, height) of the pixels that are not 0, as `cv2.boundingRect` has it; all 0 without any."""
+    height, width = image.shape
+    top, bottom, left, right = height, -1, width, -1
+    for y in range(height):
+        any_bits = np.uint8(0)
+        for x in range(width):
+            any_bits |= image[y, x]
+        if any_bits == 0:
+            continue
+        top, bottom = min(top, y), y
+        for x in range(left):
+            if image[y, x]:
+                left = x
+                break
+        for x in range(width - 1, right, -1):
+            if image[y, x]:
+                right = x
+                break
+    if bottom < 0:
+        return 0, 0, 0, 0
+    return left, top, right + 1 - left, bottom + 1 - top

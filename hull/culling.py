@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from hull.carve import Grid
 from hull.stack import stacked
@@ -86,6 +86,11 @@ class Culling:
         decided = (self._answers == INSIDE) | (self._answers == OUTSIDE)
         unsure = ~decided & (self._answers != NO_EVIDENCE)
         return np.count_nonzero(decided, axis=0), _lists_of(unsure)
+
+    @property
+    def answers(self) -> UInt8[np.ndarray, "c b"]:
+        """What each table says of each block asked so far."""
+        return self._answers
 
     @property
     def refusing(self) -> tuple[Int[np.ndarray, " b1"], Int[np.ndarray, " n"]]:

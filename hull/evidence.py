@@ -139,7 +139,7 @@ def _examined(
     n_missed = len(lines.table)
     lines = lines.chosen(_spread(np.arange(n_missed), _N_EXAMINED))
     n = len(lines.table)
-    enter, leave = _within(lines, bounds.low, bounds.high)
+    enter, leave = within_box(lines, bounds.low, bounds.high)
     line, points = _steps(lines, enter, leave, _STEP_M)
     near = _refusals(points, tables, rule)
     least = np.full(n, _N_REFUSALS + 1)
@@ -220,7 +220,7 @@ def _explained_outside(
 ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
     """(N,) whether a line passes a place beyond the box that all who see it call inside, and (N 3) where."""
     reach = float(np.median(np.linalg.norm([t.centre - bounds.centre for t in tables], axis=1)))
-    enter, leave = _within(lines, bounds.centre - reach, bounds.centre + reach)
+    enter, leave = within_box(lines, bounds.centre - reach, bounds.centre + reach)
     line, points = _steps(lines, np.maximum(enter, 0.1 * reach), leave, _FAR_STEP_M)
     beyond = ((points < bounds.low[:, None]) | (points > bounds.high[:, None])).any(axis=0)
     line, points = line[beyond], points[:, beyond]
@@ -239,7 +239,7 @@ def _deep_outside(table: SilhouetteTable, points: Float[np.ndarray, "3 n"]) -> B
     return table.ask_cells(points, half_m) == OUTSIDE
 
 
-def _within(
+def within_box(
     lines: Lines, low: Float[np.ndarray, " 3"], high: Float[np.ndarray, " 3"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """(N,) metres along each line where it enters and leaves a box; the second is smaller where it misses."""

@@ -70,7 +70,7 @@ class Carved:
     scene: RayScene
 
 
-CarveWith = Callable[[Sequence[SilhouetteTable], WitnessRule, Bounds], Carved]
+CarveWith = Callable[[Sequence[SilhouetteTable], WitnessRule, Bounds, bool], Carved]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class Settled:
     ------
     carved : what `carve_with` made of `tables`.
     tables, rule, bounds : of the cameras that are left, some with unknown regions.
-    n_lines (C,), missed : how the lines of sight of these tables fare with this surface.
+    n_lines (C,), missed : how the lines of sight of these tables fare with the surface they were judged by.
     faults : one for each camera that contradicts the others, in the rig's order.
     contradiction : share of the lines of sight that miss the surface because cameras contradict one another.
     marks : a sentence where that is much.
@@ -128,6 +128,7 @@ def settle(
     votes: int = 1,
     near: Bounds | None = None,
     mend: bool = True,
+    finely: bool = False,
 ) -> Settled:
     """Carve, look for contradictions, carve again without the cameras at fault, until the rest agrees.
 
@@ -135,18 +136,21 @@ def settle(
     `carve_with` must heed; else a camera at fault is left out altogether. `near`: as for
     `bounds_from_tables`.
     `carve_with` makes the surface of some tables and raises EmptyHullError where nothing is left; that is
-    raised where nothing is left whatever few cameras are left out.
+    raised where nothing is left whatever few cameras are left out. `finely`: it has a last argument that asks
+    for thin parts. Nobody is judged by those: what thin rests a wrong silhouette leaves explain lines by
+    chance.
     """
     cameras = _Cameras(
         tuple(rig), list(images), {table.camera_idx: table for table in prepare_tables(rig, images)}
     )
-    for _ in range(_MOST_ROUNDS):
+    judging = not finely
+    for _ in range(_MOST_ROUNDS + finely):
         box = bounds if bounds is not None else _bounds_without_blank(cameras, near)
         tables = cameras.present()
         rule = witness_rule(tables, box.centre)
         carved, error = None, None
         try:
-            carved = carve_with(tables, rule, box)
+            carved = carve_with(tables, rule, box, not judging)
         except EmptyHullError as empty:
             error = empty
         scene = None if carved is None else carved.scene
@@ -157,6 +161,9 @@ def settle(
             blamed = _blamed(tables, *missed_lines(tables, rule, _around(tables), scene, votes))
         if not blamed and carved is not None and votes == 1:
             blamed = false_holes(tables, rule, box, bool(cameras.out or cameras.faults))
+        if (blamed or carved is None or cameras.unjudged) and not judging:
+            judging = True
+            continue
         room = cameras.room()
         again = [k for k in blamed if tables[k].camera_idx in cameras.faults]
         fresh = [k for k in blamed if tables[k].camera_idx not in cameras.faults]
@@ -178,6 +185,8 @@ def settle(
             raise error
         if cameras.unjudged and _judge(cameras, carved.scene, mend):
             continue
+        if finely and judging:
+            carved = carve_with(tables, rule, box, True)
         return _settled(cameras, carved, tables, rule, box, n_lines, missed, fresh)
     raise HullError(
         f"the silhouettes contradict one another: {_names(cameras, cameras.out)} were left out, "

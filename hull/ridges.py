@@ -1,10 +1,10 @@
-"""Give back the ridges that flat triangles cut off.
+"""Give back the ridges that flat triangles cut off, and the valleys that they bridge.
 
 A visual hull is a stack of cones that meet in sharp ridges, and each camera's outline runs along the narrow
 strip that its own cone keeps between two of them. Marching cubes spans ridges and the tips of thin parts with
-flat triangles, a little inside the hull, so every outline shrinks. Here the edges whose middle lies too deep
-are split there, and the new vertex is moved out along the normal to where the hull ends. Neighbours split
-their common edge alike, so the surface stays closed.
+flat triangles, a little inside the hull, so every outline shrinks; valleys they bridge. Here the edges whose
+middle lies too deep, or too high, are split there, and the new vertex is moved along the normal to where the
+hull ends. Neighbours split their common edge alike, so the surface stays closed.
 """
 
 from __future__ import annotations
@@ -12,16 +12,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from hull.culling import Culling
 from hull.loops import mesh_loops
 from hull.surface import AT_ONCE, Crossings, by_table, exits
 from hull.tables import OUTSIDE, SilhouetteTable
 
-# In voxels: edges whose middle is deeper than the first are split; nothing is moved further than the second.
-_DEPTH_SPLIT = 0.08
+# Edges whose middle is deeper than this are split, in cells (marching cubes' own) and in pixels, whichever is
+# less; nothing is moved further than so many of the largest cells.
+_DEEP_CELLS, _DEEP_PX = 0.08, 0.23
 _FARTHEST = 0.5
+# An edge less high over a valley than so many pixels crosses a step of the pictures.
+_HIGH_PX = 0.23
+# What an edge may be; as in `hull.compiled`.
+DEEP, HIGH = 1, 2
 # The normals at an edge's ends must add up to more than this.
 _LEAST_LENGTH = 0.5
 
@@ -31,27 +36,42 @@ def raise_ridges(
     faces: Int[np.ndarray, "f 3"],
     normals: Float[np.ndarray, "v 3"],
     tables: Sequence[SilhouetteTable],
-    voxel_m: float,
+    cell_m: Float[np.ndarray, " v"],
     culling: Culling | None = None,
     votes: int = 1,
+    valleys: bool = True,
 ) -> tuple[Crossings, Int[np.ndarray, "f2 3"]]:
-    """Vertices (the given ones first) and faces with the deep edges split. `normals`: outward, unit."""
+    """Vertices (the given ones first) and faces with the deep and the high edges split.
+
+    normals : outward, unit.
+    cell_m : side of the cells that each vertex comes from, metres.
+    valleys : whether high edges are looked for.
+    """
     vertices, cut_by = crossings.vertices, crossings.cut_by
-    loops = mesh_loops()
-    middles = edge_middles_plainly if loops is None else _edge_middles_compiled
+    subject = vertices.mean(axis=0)
+    pixel_m = np.median([pixel_at(table, subject) for table in tables])
+    far_m = _FARTHEST * float(cell_m.max(initial=0.0))
+    middles = edge_middles_plainly if mesh_loops() is None else _edge_middles_compiled
     parts = []
     for first in range(0, max(len(faces), 1), AT_ONCE):
         some = faces[first : first + AT_ONCE]
-        *edges, places = middles(vertices, normals, some, voxel_m, _DEPTH_SPLIT, _LEAST_LENGTH)
-        ends_cut_by = cut_by.take(edges[0]), cut_by.take(edges[1])
-        deep = _still_inside(tables, places, *ends_cut_by, culling, votes)
-        parts.append([each.take(deep, axis=-1) for each in edges])
-    a, b, middle, way = (np.concatenate(each, axis=-1) for each in zip(*parts, strict=True))
-    way *= _FARTHEST
-    exit_at, new_cut_by = exits(tables, middle, way, culling, votes)
+        *ends_idx, middle, outward = middles(vertices, normals, some, _LEAST_LENGTH)
+        cell = np.minimum(cell_m.take(ends_idx[0]), cell_m.take(ends_idx[1]))
+        up_m = np.minimum(_DEEP_CELLS * cell, _DEEP_PX * pixel_m)
+        down_m = np.clip(_HIGH_PX * pixel_m, up_m, far_m)
+        ends_cut_by = cut_by.take(ends_idx[0]), cut_by.take(ends_idx[1])
+        depths_m = (up_m, down_m, far_m)
+        kind = edge_kinds(tables, middle, outward, *depths_m, *ends_cut_by, culling, votes, valleys)
+        split = np.flatnonzero(kind)
+        far = far_m * outward.take(split, axis=1)
+        # Out of valleys the way begins below and ends in the middle, which lies outside.
+        origin = middle.take(split, axis=1) - np.where(kind[split] == HIGH, far, 0.0)
+        parts.append([ends_idx[0].take(split), ends_idx[1].take(split), origin, far])
+    a, b, origin, way = (np.concatenate(each, axis=-1) for each in zip(*parts, strict=True))
+    exit_at, new_cut_by = exits(tables, origin, way, culling, votes)
     ends = new_cut_by >= 0
     a, b = a[ends], b[ends]
-    new = (middle + way * exit_at)[:, ends].T
+    new = (origin + way * exit_at)[:, ends].T
     start, end = faces.T.ravel(), faces[:, [1, 2, 0]].T.ravel()
     # Both faces at an edge look its new vertex up by the edge's name.
     order = np.argsort(a * len(vertices) + b)
@@ -62,11 +82,11 @@ def raise_ridges(
     wanted = np.minimum(start[sought], end[sought]) * len(vertices) + np.maximum(start[sought], end[sought])
     place = np.minimum(np.searchsorted(names, wanted), max(len(names) - 1, 0))
     found = names[place] == wanted if len(names) else np.zeros(0, dtype=bool)
-    split = np.full(len(start), -1)
-    split[sought[found]] = len(vertices) + order[place[found]]
+    split_by = np.full(len(start), -1)
+    split_by[sought[found]] = len(vertices) + order[place[found]]
     return (
         Crossings(np.concatenate([vertices, new]), np.concatenate([cut_by, new_cut_by[ends]])),
-        split_faces(faces, split.reshape(3, -1).T),
+        split_faces(faces, split_by.reshape(3, -1).T),
     )
 
 
@@ -74,12 +94,12 @@ def _edge_middles_compiled(
     vertices: Float[np.ndarray, "v 3"],
     normals: Float[np.ndarray, "v 3"],
     faces: Int[np.ndarray, "f 3"],
-    *numbers: float,
+    least_length: float,
 ) -> tuple[np.ndarray, ...]:
     loops, room = mesh_loops(), 3 * len(faces)
     assert loops is not None
-    edges = [np.empty(room, dtype=np.int64) for _ in range(2)] + [np.empty((3, room)) for _ in range(3)]
-    n = loops.edge_middles(vertices, normals, faces, *numbers, *edges)
+    edges = [np.empty(room, dtype=np.int64) for _ in range(2)] + [np.empty((3, room)) for _ in range(2)]
+    n = loops.edge_middles(vertices, normals, faces, least_length, *edges)
     return tuple(np.ascontiguousarray(each[..., :n]) for each in edges)
 
 
@@ -87,18 +107,10 @@ def edge_middles_plainly(
     vertices: Float[np.ndarray, "v 3"],
     normals: Float[np.ndarray, "v 3"],
     faces: Int[np.ndarray, "f 3"],
-    voxel_m: float,
-    depth: float,
     least_length: float,
-) -> tuple[
-    Int[np.ndarray, " n"],
-    Int[np.ndarray, " n"],
-    Float[np.ndarray, "3 n"],
-    Float[np.ndarray, "3 n"],
-    Float[np.ndarray, "3 n"],
-]:
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "3 n"], Float[np.ndarray, "3 n"]]:
     """The ends a < b of each edge where the surface does not fold back (the sum of their normals is so long);
-    its middle, the way outward (a voxel long), and the place that far outside (`depth`, in voxels)."""
+    its middle, and the unit way outward."""
     start, end = faces.T.ravel(), faces[:, [1, 2, 0]].T.ravel()
     # On a closed surface every edge runs once in each direction: the rising ones name each edge once.
     a, b = start[start < end], end[start < end]
@@ -107,56 +119,109 @@ def edge_middles_plainly(
     length = np.sqrt((way**2).sum(axis=0))
     flat = np.flatnonzero(length > least_length)
     a, b = a.take(flat), b.take(flat)
-    way = way.take(flat, axis=1) * (voxel_m / np.maximum(length.take(flat), 1e-30))
+    way = way.take(flat, axis=1) * (1.0 / np.maximum(length.take(flat), 1e-30))
     middle = 0.5 * (columns.take(a, axis=1) + columns.take(b, axis=1))
-    return a, b, middle, way, middle + depth * way
+    return a, b, middle, way
 
 
-def _still_inside(
+def edge_kinds(
     tables: Sequence[SilhouetteTable],
-    places: Float[np.ndarray, "3 n"],
+    middle: Float[np.ndarray, "3 n"],
+    outward: Float[np.ndarray, "3 n"],
+    up_m: Float[np.ndarray, " n"],
+    down_m: Float[np.ndarray, " n"],
+    far_m: float,
     cut_by_1: Int[np.ndarray, " n"],
     cut_by_2: Int[np.ndarray, " n"],
     culling: Culling | None,
     votes: int,
-) -> Int[np.ndarray, " k"]:
-    """Which (K,) of the places (3 N) fewer than `votes` cameras see outside.
+    valleys: bool,
+) -> UInt8[np.ndarray, " n"]:
+    """(N,) DEEP: the edge's middle stays inside the hull when it goes up; HIGH (`valleys`): it stays outside
+    when it goes down, and is inside when it goes down far; else 0.
 
-    The cameras that cut an edge's ends refuse almost all of its middle, so one alone is asked first.
+    The cameras that cut an edge's ends refuse almost all of its middle, so with one vote they are asked
+    first; and only they, or who refuses it higher up, may refuse it further down.
     """
+    # All these places are so near to the middle that the answers about its block hold.
+    blocks = None if culling is None else culling.blocks_of(middle)
+    kind = np.zeros(middle.shape[1], dtype=np.uint8)
     if culling is not None and culling.stack is not None:
-        stack, named = culling.stack, culling.blocks_of(places)
-        refused = np.zeros(len(named), dtype=bool)
-        stack.loops.refused(
+        stack = culling.stack
+        stack.loops.edge_kinds(
             stack.numbers,
             stack.projections,
-            places,
+            middle,
+            outward,
+            up_m,
+            down_m,
+            far_m,
             cut_by_1,
             cut_by_2,
-            named,
+            blocks,
             *culling.refusing,
             votes,
-            refused,
+            valleys,
+            kind,
         )
-        return np.flatnonzero(~refused)
-    chosen = np.arange(places.shape[1])
-    for cut_by in (cut_by_1, cut_by_2) if votes == 1 else ():
-        still = np.ones(len(chosen), dtype=bool)
-        for table_idx, asked in by_table(cut_by.take(chosen), len(tables)):
-            answers = tables[table_idx].ask_points(places.take(chosen.take(asked), axis=1))
-            still[asked] = answers != OUTSIDE
-        chosen = chosen.take(np.flatnonzero(still))
-    places = places.take(chosen, axis=1)
-    blocks = None if culling is None else culling.blocks_of(places)
-    votes_left = np.full(len(chosen), votes)
+        return kind
+    first = np.stack([cut_by_1, cut_by_2]) if votes == 1 else np.zeros((0, len(kind)), dtype=np.int16)
+    by = _refused_by(tables, middle + up_m * outward, first, culling, blocks, votes)
+    kind[by < 0] = DEEP
+    open_ = np.flatnonzero(by >= 0) if valleys else np.zeros(0, dtype=np.intp)
+    inner = (middle - down_m * outward).take(open_, axis=1)
+    where = None if blocks is None else blocks.take(open_)
+    if votes == 1:
+        above = np.zeros(len(open_), dtype=bool)
+        for each in (*first, by):
+            for table_idx, some in by_table(each.take(open_), len(tables)):
+                above[some] |= tables[table_idx].ask_points(inner.take(some, axis=1)) == OUTSIDE
+    else:
+        above = _refused_by(tables, inner, first.take(open_, axis=1), culling, where, votes) >= 0
+    open_ = open_[above]
+    where = None if blocks is None else blocks.take(open_)
+    below = (middle - far_m * outward).take(open_, axis=1)
+    kind[open_[_refused_by(tables, below, first.take(open_, axis=1), culling, where, votes) < 0]] = HIGH
+    return kind
+
+
+def _refused_by(
+    tables: Sequence[SilhouetteTable],
+    places: Float[np.ndarray, "3 n"],
+    first: Int[np.ndarray, "k n"],
+    culling: Culling | None,
+    blocks: Int[np.ndarray, " n"] | None,
+    votes: int,
+) -> Int[np.ndarray, " n"]:
+    """(N,) the table that is the `votes`-th to see a place (3 N) outside; -1: fewer do. `first`: tables (or
+    -1) that are asked before the others; one vote must be enough then."""
+    refused_by = np.full(places.shape[1], -1, dtype=np.int16)
+    for each in first:
+        open_ = np.flatnonzero(refused_by < 0)
+        for table_idx, asked in by_table(each.take(open_), len(tables)):
+            some = open_.take(asked)
+            refused_by[some[tables[table_idx].ask_points(places.take(some, axis=1)) == OUTSIDE]] = table_idx
+    votes_left = np.where(refused_by < 0, votes, 0)
     for table_idx, table in enumerate(tables):
         if culling is None or blocks is None:
             asked = np.flatnonzero(votes_left)
         else:
             asked = culling.may_refuse(table_idx, blocks)
             asked = asked[votes_left[asked] > 0]
-        votes_left[asked[table.ask_points(places.take(asked, axis=1)) == OUTSIDE]] -= 1
-    return chosen[votes_left > 0]
+        refused = asked[table.ask_points(places.take(asked, axis=1)) == OUTSIDE]
+        votes_left[refused] -= 1
+        refused_by[refused[votes_left[refused] == 0]] = table_idx
+    return refused_by
+
+
+def pixel_at(table: SilhouetteTable, point: Float[np.ndarray, " 3"]) -> float:
+    """About what a pixel covers at a point (3,), metres."""
+    turned = table.projection[:, :3]
+    # The rows of P minus the picture's middle times its third row; only a scale is wanted, so the area will
+    # do.
+    focal_px = np.sqrt(abs(np.linalg.det(turned)) / max(float(np.linalg.norm(turned[2])) ** 3, 1e-12))
+    depth = table.projection[2, :3] @ point + table.projection[2, 3]
+    return float(max(depth, 1e-6) / focal_px)
 
 
 def split_faces(faces: Int[np.ndarray, "f 3"], middle: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "f2 3"]:

@@ -26,7 +26,7 @@ from jaxtyping import Float, Int, UInt8
 
 from capture.camera import Camera
 from hull.errors import HullError
-from hull.loops import table_loops
+from hull.loops import mesh_loops
 
 # Sets of answers are OR-ed together; a set of one element is a decision.
 INSIDE = 1
@@ -327,7 +327,7 @@ def _surroundings(image: UInt8[np.ndarray, "h w"]) -> tuple[UInt8[np.ndarray, "h
     directions.
     """
     height, width = image.shape
-    loops = table_loops()
+    loops = mesh_loops()
     # OpenCV takes four times as long, which counts for pictures of several megapixels.
     x, y, w, h = cv2.boundingRect(image) if loops is None else loops.picture_box(np.ascontiguousarray(image))
     if w == 0:

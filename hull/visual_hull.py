@@ -29,6 +29,7 @@ from hull.soft import carve_soft, cross_softly
 from hull.soft_tables import SoftTable, prepare_soft_tables, sure_mask
 from hull.surface import cross_exactly
 from hull.tables import SilhouetteTable, prepare_tables
+from hull.thin_parts import FINE_ENOUGH_M, with_cameras, with_thin_parts
 from hull.vertex_facts import vertex_facts
 from hull.witnesses import WitnessRule, witness_rule
 
@@ -161,15 +162,17 @@ def build_hull(
         # Who contradicts whom is asked of what is nearly certain.
         images = [None if image is None else sure_mask(image) for image in images]
 
-    def carve_with(tables: Sequence[SilhouetteTable], rule: WitnessRule, box: Bounds) -> Carved:
+    def carve_with(tables: Sequence[SilhouetteTable], rule: WitnessRule, box: Bounds, finely: bool) -> Carved:
         chosen = None if soft is None else [soft[table.camera_idx] for table in tables]
-        return _surface(tables, chosen, rule, box, voxel_m, options.votes)
+        return _surface(tables, chosen, rule, box, voxel_m, options.votes, finely)
+
+    finely = soft is None and voxel_m > FINE_ENOUGH_M
 
     faults: tuple[CameraFault, ...] = ()
     marks: tuple[str, ...] = ()
     contradiction = 0.0
     if options.find_faults:
-        settled = settle(cameras, images, bounds, carve_with, options.votes, near, mend=soft is None)
+        settled = settle(cameras, images, bounds, carve_with, options.votes, near, soft is None, finely)
         carved, faults, box = settled.carved, settled.faults, settled.bounds
         contradiction = settled.contradiction
         marks = (
@@ -179,7 +182,7 @@ def build_hull(
     else:
         tables = prepare_tables(cameras, images)
         box = bounds if bounds is not None else bounds_from_tables(tables, near)
-        carved = carve_with(tables, witness_rule(tables, box.centre), box)
+        carved = carve_with(tables, witness_rule(tables, box.centre), box, finely)
     vertices, faces = carved.vertices, carved.faces
     normals = vertex_normals(vertices, faces)
     marks = (
@@ -210,27 +213,34 @@ def _surface(
     bounds: Bounds,
     voxel_m: float,
     votes: int,
+    finely: bool,
 ) -> Carved:
-    """The closed surface of these tables' hull, or of their soft ones. Raises EmptyHullError."""
+    """The closed surface of these tables' hull, or of their soft ones; `finely`: with thin parts and
+    valleys. Raises EmptyHullError."""
     grid = grid_over(bounds, voxel_m)
     blocks = carve(tables, rule, grid, votes) if soft is None else carve_soft(soft, rule, grid)
     if not blocks.n_voxels:
         raise EmptyHullError(why_empty(tables, rule, bounds.low, bounds.high))
     surface = binary_surface(blocks)
     tables = tables if soft is None else soft
-    culling = Culling(tables, grid)
-    if soft is None:
-        crossings = cross_exactly(surface, grid, tables, culling, votes)
-    else:
+    culling, fine = Culling(tables, grid), grid
+    if soft is not None:
         crossings = cross_softly(surface, grid, soft, culling)
+    else:
+        if finely:
+            surface, fine = with_thin_parts(surface, grid, culling, rule, votes)
+        crossings = cross_exactly(surface, fine, tables, culling, votes)
+        if fine is not grid:
+            crossings = with_cameras(crossings, surface, fine, culling, rule, votes)
     crossings, faces = raise_ridges(
         crossings,
         surface.faces,
         vertex_normals(crossings.vertices, surface.faces, n_rings=1),
         tables,
-        voxel_m,
+        fine.voxel_m * np.abs(surface.outer - surface.inner).sum(axis=1),
         culling,
         votes,
+        finely,
     )
     kept, faces, problems = keep_what_matters(crossings.vertices, faces, tables)
     vertices, cut_by = crossings.vertices[kept], crossings.cut_by[kept]

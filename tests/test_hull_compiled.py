@@ -82,6 +82,7 @@ def test_the_numbers_that_stand_in_two_places_agree() -> None:
     assert loops is not None
     for name in ("INSIDE", "OUTSIDE", "NO_EVIDENCE", "UNDECIDED", "FIRST_OUTLINE_BLOCK"):
         assert getattr(loops, name) == getattr(tables, name), name
+    assert (loops.DEEP, loops.HIGH) == (ridges.DEEP, ridges.HIGH)
     assert tables.BLOCK_PX == 4, "hull.compiled counts on blocks of four pixels"
     table = _scene("clean")[0]
     assert len(table.numbers) == loops.N_NUMBERS
@@ -136,7 +137,8 @@ def test_the_same_surface_with_the_same_facts(scene: tuple[SilhouetteTable, ...]
         culling = Culling(some, grid)
         crossings = cross_exactly(surface, grid, some, culling, votes)
         normals = cleaning.vertex_normals(crossings.vertices, surface.faces, n_rings=1)
-        raised, faces = ridges.raise_ridges(crossings, surface.faces, normals, some, VOXEL_M, culling, votes)
+        cell_m = np.full(len(normals), VOXEL_M)
+        raised, faces = ridges.raise_ridges(crossings, surface.faces, normals, some, cell_m, culling, votes)
         results.append((raised, faces, slack.outlines_at(raised.vertices, culling)))
     (raised, faces, outlines), (plainly, plain_faces, plain_outlines) = results
     assert np.array_equal(faces, plain_faces)
@@ -187,7 +189,7 @@ def test_the_loops_over_the_mesh_agree_with_numpy(
 
 
 def test_a_pictures_box_is_the_one_that_opencv_finds() -> None:
-    loops, random = table_loops(), np.random.default_rng(3)
+    loops, random = mesh_loops(), np.random.default_rng(3)
     assert loops is not None
     for size in ((40, 60), (33, 7), (1, 1), (5, 200)):
         assert loops.picture_box(np.zeros(size, dtype=np.uint8)) == (0, 0, 0, 0)
@@ -206,9 +208,9 @@ def test_a_place_behind_a_camera_is_no_evidence_compiled_either() -> None:
     stack.loops.ask_cells(stack.numbers, stack.projections, places, 0.001, answers)
     assert answers[0, 0] == NO_EVIDENCE
     assert answers[0].tolist() == table.ask_cells(places, 0.001).tolist()
-    refused = np.zeros(2, dtype=bool)
-    none, all_ = np.full(2, -1, dtype=np.int16), (np.array([0, 1]), np.array([0]))
-    block = np.zeros(2, dtype=np.int64)
-    stack.loops.refused(stack.numbers, stack.projections, places, none, none, block, *all_, 1, refused)
-    assert not refused[0]
-    assert refused.tolist() == (table.ask_points(places) == OUTSIDE).tolist()
+    refused = [
+        stack.loops.refuser(stack.numbers, stack.projections, *place, -1, -1, 0, 1, np.array([0]), 1)
+        for place in places.T
+    ]
+    assert refused[0] == -1
+    assert [by == 0 for by in refused] == (table.ask_points(places) == OUTSIDE).tolist()

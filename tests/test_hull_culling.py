@@ -49,8 +49,9 @@ def test_the_surface_is_the_same_with_and_without_culling(scene: str) -> None:
     assert np.abs(culled.vertices - plain.vertices).max() < 1e-9
     assert (culled.cut_by == plain.cut_by).all()
     normals = vertex_normals(plain.vertices, surface.faces)
-    raised, faces = raise_ridges(culled, surface.faces, normals, tables, 0.016, culling)
-    plainly, plain_faces = raise_ridges(plain, surface.faces, normals, tables, 0.016)
+    cell_m = np.full(len(normals), 0.016)
+    raised, faces = raise_ridges(culled, surface.faces, normals, tables, cell_m, culling)
+    plainly, plain_faces = raise_ridges(plain, surface.faces, normals, tables, cell_m)
     assert len(raised.vertices) > 1.05 * len(plain.vertices), "no ridge was raised"
     assert (faces == plain_faces).all()
     assert np.abs(raised.vertices - plainly.vertices).max() < 1e-9
