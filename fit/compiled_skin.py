@@ -323,3 +323,44 @@ def both_ways(matrix, right, left, product, transposed):
             total += m * right[b]
             transposed[b] += m * x
         product[row] = total
+
+
+@_kernel
+@no_type_check
+def betas_along_normals(used, normals, turned, shape, bone_idx, bone_weight, by_bones, out):
+    """out (N B): how far the used vertices go along their normals (V 3) with the betas, as `shape_moves`."""
+    n_betas = out.shape[1]
+    for i in range(len(used)):
+        v = used[i]
+        for b in range(n_betas):
+            out[i, b] = 0.0
+        for c in range(3):
+            r = 0.0
+            for a in range(3):
+                r += normals[v, a] * turned[v, a, c]
+            for b in range(n_betas):
+                out[i, b] += r * shape[v, c, b]
+            for k in range(bone_idx.shape[1]):
+                w = bone_weight[v, k] * normals[v, c]
+                if w != 0.0:
+                    for b in range(n_betas):
+                        out[i, b] += w * by_bones[bone_idx[v, k], c, b]
+
+
+@_kernel
+@no_type_check
+def pose_by_columns(used, normals, ptr, joint, blocks, columns, on_pose, on_shift):
+    """on_pose (3 J, B), on_shift (3, B): moves along normals by pose and translation, times columns (N B)."""
+    n_columns = columns.shape[1]
+    for i in range(len(used)):
+        v = used[i]
+        x, y, z = normals[v, 0], normals[v, 1], normals[v, 2]
+        for a in range(3):
+            for b in range(n_columns):
+                on_shift[a, b] += normals[v, a] * columns[i, b]
+        for n in range(ptr[v], ptr[v + 1]):
+            for e in range(3):
+                along = x * blocks[n, 0, e] + y * blocks[n, 1, e] + z * blocks[n, 2, e]
+                row = 3 * joint[n] + e
+                for b in range(n_columns):
+                    on_pose[row, b] += along * columns[i, b]

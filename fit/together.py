@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from scipy.linalg import cho_factor, cho_solve
 
 from fit.align import Alignment
+from fit.articulation import PosedBody
 from fit.body.parts import region_of_vertices
 from fit.initialise import PoseFinder
 from fit.settings import FitSettings, TogetherSettings
@@ -50,11 +51,9 @@ class Together:
         template, joints = fitter.shaped(self.betas), fitter.joints(self.betas)
         out = []
         for alignment, pose, translation in zip(alignments, self.poses, self.translations, strict=True):
-            vertices, rotations, _ = fitter.linearised(
-                BodyState(template, pose, translation, self.betas), joints
-            )
-            gap = fitter.posed(alignment.state) - vertices
-            own = template + np.linalg.solve(rotations, gap[:, :, None])[:, :, 0]
+            body = fitter.body(BodyState(template, pose, translation, self.betas), joints)
+            gap = fitter.posed(alignment.state) - body.vertices
+            own = template + np.linalg.solve(body.rotations, gap[:, :, None])[:, :, 0]
             out.append(replace(alignment, state=BodyState(own, pose, translation, self.betas)))
         return out
 
@@ -136,15 +135,15 @@ def _round(
     frames = []
     for k in chosen:
         state = BodyState(template, at.poses[k], at.translations[k], at.betas)
-        vertices, rotations, jacobian = fitter.linearised(state, joints)
-        normals = vertex_normals(vertices, model.faces)
-        offset = np.einsum("va,va->v", cloth.vertices[k] - vertices, normals)
+        body = fitter.body(state, joints)
+        normals = vertex_normals(body.vertices, model.faces)
+        offset = np.einsum("va,va->v", cloth.vertices[k] - body.vertices, normals)
         same = np.einsum("va,va->v", cloth.normals[k], normals) > SAME_SIDE
-        frames.append((vertices, rotations, jacobian, normals, offset, same))
+        frames.append((body, normals, offset, same))
     thickness = held
     if thickness is None:
         noise = bending_noise(model, at.poses[chosen], vertex_normals(template, model.faces))
-        offsets = np.stack([f[4] for f in frames])
+        offsets = np.stack([f[2] for f in frames])
         thickness = expected_thickness(
             offsets, noise, thickness_per_movement(model), model.faces, settings.thickness
         )
@@ -154,25 +153,26 @@ def _round(
     reduced, pull = shape_prior * np.eye(n_betas), -shape_prior * at.betas[:n_betas]
     energy = shape_prior * float(at.betas @ at.betas)
     eliminated = []
-    for k, (vertices, rotations, jacobian, normals, offset, same) in zip(chosen, frames, strict=True):
-        area = vertex_areas(vertices, model.faces)
+    for k, (body, normals, offset, same) in zip(chosen, frames, strict=True):
+        area = vertex_areas(body.vertices, model.faces)
         share = weights.n_independent * part_weight * same * area / area.sum()
         residual, weight, data = _data_term(offset, thickness, share, weights)
         energy += data
         used = np.flatnonzero(weight > 0)[:: weights.every_vertex]
-        along = _along_normals(fitter, at.poses[k], rotations, jacobian, normals, used, n_betas)
-        weighted = along * (weights.every_vertex * weight[used])[:, None]
-        hessian, gradient = weighted.T @ along, weighted.T @ residual[used]
-        n_pose = jacobian.shape[1]
-        own, rhs = hessian[:n_pose, :n_pose], gradient[:n_pose]
+        weight = weights.every_vertex * weight[used]
+        own, rhs = _by_pose(body, normals, used, weight, residual[used])
+        cross, corner, rhs_betas = _by_betas(
+            fitter, at.poses[k], body, normals, used, weight, residual[used], n_betas
+        )
+        n_pose = len(rhs)
         away = at.poses[k].ravel()[3:] - finder.prior.mean
         own[3:-3, 3:-3] += weights.pose_prior * finder.prior.precision
         rhs[3:-3] -= weights.pose_prior * finder.prior.precision @ away
         own[np.diag_indices(n_pose)] += 1e-3 * weights.n_independent
         energy += weights.pose_prior * float(away @ finder.prior.precision @ away)
-        cross, factor = hessian[:n_pose, n_pose:], cho_factor(own)
-        reduced += hessian[n_pose:, n_pose:] - cross.T @ cho_solve(factor, cross)
-        pull += gradient[n_pose:] - cross.T @ cho_solve(factor, rhs)
+        factor = cho_factor(own)
+        reduced += corner - cross.T @ cho_solve(factor, cross)
+        pull += rhs_betas - cross.T @ cho_solve(factor, rhs)
         eliminated.append((k, factor, cross, rhs))
     step = np.linalg.solve(reduced, pull)
     moved = float(np.abs(step).max(initial=0.0))
@@ -213,23 +213,56 @@ def _data_term(
     )
 
 
-def _along_normals(
-    fitter: Fitter,
-    pose: Float[np.ndarray, "j 3"],
-    rotations: Float[np.ndarray, "v 3 3"],
-    jacobian: Float[np.ndarray, "m p"],
+def _by_pose(
+    body: PosedBody,
     normals: Float[np.ndarray, "v 3"],
     used: Int[np.ndarray, "n"],
-    n_betas: int,
-) -> Float[np.ndarray, "n q"]:
-    """How far the used vertices move along their normals with pose, translation and betas."""
+    weight: Float[np.ndarray, "n"],
+    residual: Float[np.ndarray, "n"],
+) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p"]]:
+    """Matrix and right-hand side, over pose and translation, of residuals along the vertices' normals."""
+    row, column = np.triu_indices(3)
+    lumped, force = np.zeros((len(normals), 6)), np.zeros_like(normals)
     normal = normals[used]
-    by_pose = np.einsum("na,nap->np", normal, jacobian.reshape(len(normals), 3, -1)[used])
+    lumped[used] = weight[:, None] * normal[:, row] * normal[:, column]
+    force[used] = (weight * residual)[:, None] * normal
+    _, on_pose, on_shift, _ = body.gathered(force)
+    rhs = np.concatenate([on_pose.ravel(), on_shift])
+    return body.squared(lumped, with_bones=False)[: len(rhs), : len(rhs)], rhs
+
+
+def _by_betas(
+    fitter: Fitter,
+    pose: Float[np.ndarray, "j 3"],
+    body: PosedBody,
+    normals: Float[np.ndarray, "v 3"],
+    used: Int[np.ndarray, "n"],
+    weight: Float[np.ndarray, "n"],
+    residual: Float[np.ndarray, "n"],
+    n_betas: int,
+) -> tuple[Float[np.ndarray, "p b"], Float[np.ndarray, "b b"], Float[np.ndarray, "b"]]:
+    """The same, between (pose, translation) and betas, and of the betas: matrix and right-hand side."""
+    from fit import compiled_skin
+
+    at, n_pose = body.articulation, 3 * len(body.articulation.parents)
+    cross = np.zeros((n_pose + 3, n_betas))
     if not n_betas:
-        return by_pose
-    shape = fitter.shape
-    turned = np.einsum("na,nab->nb", normal, rotations[used])
-    by_template = np.einsum("nb,nbk->nk", turned, fitter.model.shape_directions[used])
-    # A bone's offset moves a vertex by the vertex's weight on that bone.
-    bones = (fitter.model.weights[used][:, :, None] * normal[:, None, :]).reshape(len(used), -1)
-    return np.concatenate([by_pose, by_template + bones @ shape.offsets_by_betas(pose)], axis=1)
+        return cross, np.zeros((0, 0)), np.zeros(0)
+    moves = np.empty((len(used), n_betas))
+    offsets = fitter.shape.offsets_by_betas(pose).reshape(-1, 3, n_betas)
+    compiled_skin.betas_along_normals(
+        used,
+        normals,
+        body.rotations,
+        fitter.model.shape_directions,
+        at.bone_idx,
+        at.bone_weight,
+        offsets,
+        moves,
+    )
+    root = np.sqrt(weight)
+    rooted = moves * root[:, None]
+    compiled_skin.pose_by_columns(
+        used, normals, at.ptr, at.joint, body.blocks, moves * weight[:, None], cross[:n_pose], cross[n_pose:]
+    )
+    return cross, rooted.T @ rooted, rooted.T @ (root * residual)

@@ -12,7 +12,7 @@ from fit.settings import FitSettings
 from fit.state import BodyState
 from fit.surface import vertex_normals
 from fit.thickness import bending_noise, expected_thickness, thickness_per_movement
-from fit.together import Together, can_be_together, fit_together
+from fit.together import Together, _by_betas, _by_pose, can_be_together, fit_together
 from tests.test_fit_pose_finding import finder, fitter
 
 SETTINGS = FitSettings(n_points=6000)
@@ -175,3 +175,33 @@ def test_what_bending_does_is_not_cloth():
     np.testing.assert_allclose(thickness.expected, SETTINGS.thickness.thinnest_m, atol=1e-4)
     more = expected_thickness(offsets, 0.0 * noise, ratio, model.faces, SETTINGS.thickness)
     assert more.expected[knee].max() > 0.003
+
+
+def test_a_frames_equations_are_those_of_dense_derivatives():
+    random, fitted = np.random.default_rng(2), fitter()
+    model, n = fitted.model, fitted.model.n_vertices
+    betas, pose = 0.5 * random.normal(size=model.n_betas), 0.3 * random.normal(size=(24, 3))
+    state = BodyState(fitted.shaped(betas), pose, random.normal(size=3), betas)
+    body = fitted.body(state)
+    normals, used = vertex_normals(body.vertices, model.faces), np.arange(1, n, 3)
+    weight, residual = random.random(len(used)), random.normal(size=len(used))
+    moves = np.einsum("va,vap->vp", normals, body.jacobian().reshape(n, 3, -1))
+    step = 1e-5
+    by_betas = np.empty((n, 3))
+    for k in range(3):
+        ends = []
+        for sign in (-1.0, 1.0):
+            other = betas + sign * step * (np.arange(model.n_betas) == 60 * k)
+            ends.append(fitted.posed(state.moved(template=fitted.shaped(other), betas=other)))
+        by_betas[:, k] = np.einsum("va,va->v", normals, (ends[1] - ends[0]) / (2 * step))
+    pose_matrix, pose_rhs = _by_pose(body, normals, used, weight, residual)
+    cross, corner, rhs = _by_betas(fitted, pose, body, normals, used, weight, residual, model.n_betas)
+    weighted = weight[:, None] * moves[used]
+    np.testing.assert_allclose(pose_matrix, weighted.T @ moves[used], atol=1e-9)
+    np.testing.assert_allclose(pose_rhs, weighted.T @ residual, atol=1e-9)
+    three = 60 * np.arange(3)
+    np.testing.assert_allclose(cross[:, three], weighted.T @ by_betas[used], atol=1e-6)
+    np.testing.assert_allclose(
+        corner[np.ix_(three, three)], (weight * by_betas[used].T) @ by_betas[used], atol=1e-6
+    )
+    np.testing.assert_allclose(rhs[three], by_betas[used].T @ (weight * residual), atol=1e-6)
