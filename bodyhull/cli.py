@@ -14,7 +14,7 @@ import tyro
 
 import bodyhull
 from bodyhull.body_commands import Body, perform_body
-from bodyhull.config import RunConfig
+from bodyhull.config import FIT_OPTIONS, RunConfig, Units, Up
 from bodyhull.errors import ERROR, FRAMES_FAILED, OK, UserError
 from bodyhull.folder import RunFolder
 from bodyhull.study_commands import RigStudy, perform_rig_study
@@ -38,10 +38,12 @@ class Carve(RunConfig):
 
 @dataclass(frozen=True)
 class Fit:
-    """Fit the body to the hulls of a run: cloth alignments, fusion shape, track."""
+    """Fit the body to the hulls of a run, or to a folder of scans: cloth alignments, fusion shape, track."""
 
-    run: RunArgument
-    """Run folder with hulls."""
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|SCANS")]
+    """Run folder with hulls; or, with --out, a folder of scans, one .ply, .obj, .off or .npz a frame."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
+    """Run folder to make from a folder of scans. Finished work in it is kept."""
     body: str | None = None
     """Body model, if another than the run was made with: free:neutral, free:female, free:male, or a path."""
     keypoints: Path | None = None
@@ -50,6 +52,29 @@ class Fit:
     """Replace the fit that the folder holds."""
     pose_prior: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Pose prior, if another than the run was made with: an .npz with mean (69) and covariance (69 x 69)."""
+    frames: Annotated[str | None, tyro.conf.arg(metavar="START:STOP:STEP")] = None
+    """Which scans; all by default."""
+    units: Units = "auto"
+    """Unit of the scans."""
+    up: Up = "auto"
+    """Axis of the scans that points up."""
+    labels: Annotated[str | None, tyro.conf.arg(metavar="auto|none|DIR")] = None
+    """Skin and cloth: as labelled in the scans' files or told by colour (auto), all cloth (none), or label
+    files in a folder."""
+    preset: Literal["buff", "inria"] | None = None
+    """The paper's own weights for BUFF or INRIA data, instead of ours."""
+    lambda_skin: float | None = None
+    """Weight of E_skin: bare points lie on the body. Ours is 1."""
+    lambda_outside: float | None = None
+    """Weight of E_outside: cloth points do not lie inside the body. Ours is 1."""
+    lambda_fit: float | None = None
+    """Weight of E_fit in fusion and detail: the body stays near its clothes. Ours: see fit/settings.py."""
+    lambda_cpl: float | None = None
+    """Weight of E_cpl: the free-form body keeps to the model. Ours: see fit/settings.py."""
+    lambda_prior: float | None = None
+    """Weight of the pose prior. Ours is 0.001."""
+    lambda_shape: float | None = None
+    """Weight of the shape prior. Ours is 0.001."""
 
 
 @dataclass(frozen=True)
@@ -204,13 +229,7 @@ def perform(command: object) -> int:
             carve_stage(config)
             return frames_code(config.out, "hull")
         case Fit():
-            from bodyhull.fitting import fit_stage
-
-            config = configuration_of(
-                command.run, command.overwrite, command.body, command.keypoints, command.pose_prior
-            )
-            fit_stage(config)
-            return frames_code(command.run, "fit")
+            return fit(command)
         case Overlay():
             from bodyhull.drawing import draw_stage
 
@@ -234,24 +253,48 @@ def perform(command: object) -> int:
     raise AssertionError(f"no such command: {command!r}")
 
 
-def configuration_of(
-    root: Path,
-    overwrite: bool = False,
-    body: str | None = None,
-    keypoints: Path | None = None,
-    pose_prior: Path | None = None,
-) -> RunConfig:
-    """The configuration that a run folder was made with, with the changes asked for."""
+def configuration_of(root: Path, overwrite: bool = False, **changes: object) -> RunConfig:
+    """The configuration that a run folder was made with, with the changes asked for (None: none)."""
     folder = RunFolder(root)
     state = folder.require_state()
     config = dataclasses.replace(RunConfig.from_dict(state["configuration"]), out=root, overwrite=overwrite)
-    if body is not None:
-        config = dataclasses.replace(config, body=body)
-    if keypoints is not None:
-        config = dataclasses.replace(config, keypoints=keypoints)
-    if pose_prior is not None:
-        config = dataclasses.replace(config, pose_prior=pose_prior)
-    return config
+    return dataclasses.replace(config, **{k: v for k, v in changes.items() if v is not None})  # type: ignore[arg-type]
+
+
+def fit(command: Fit) -> int:
+    """Fit a run folder, or a folder of scans into a new one."""
+    from bodyhull.fit_input import scan_stage
+    from bodyhull.fitting import fit_stage
+
+    options = {k: getattr(command, k) for k in FIT_OPTIONS}
+    root = command.run if command.out is None else command.out
+    if command.out is not None:
+        if command.keypoints is not None:
+            raise UserError("--keypoints: scans have no cameras that keypoints could belong to; leave it out")
+        given = {k: v for k, v in options.items() if v is not None}
+        scan_stage(
+            RunConfig(
+                command.run,
+                root,
+                frames=command.frames,
+                units=command.units,
+                up=command.up,
+                overwrite=command.overwrite,
+                **given,
+            )
+        )
+    elif (command.frames, command.units, command.up) != (None, "auto", "auto"):
+        raise UserError("--frames, --units and --up are for scans: give the run folder to make with --out")
+    elif not RunFolder(root).state_file.is_file() and root.is_dir():
+        from hull.scan_files import list_scans
+
+        list_scans(root)
+        raise UserError(f"{root}: holds scans; say where their run goes: bodyhull fit {root} --out RUN")
+    config = configuration_of(root, command.overwrite, **options)
+    fit_stage(config)
+    folder = RunFolder(root)
+    print(f"fusion shape: {folder.fusion_mesh}\nbodies:       {folder.mesh(0).parent}")
+    return frames_code(root, "fit")
 
 
 def frames_code(root: Path, stage: str) -> int:

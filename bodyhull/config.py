@@ -13,10 +13,16 @@ import tyro
 from bodyhull.errors import UserError
 
 if TYPE_CHECKING:
+    from fit.settings import FitSettings
     from hull.visual_hull import HullOptions
 
 Units = Literal["auto", "m", "cm", "mm"]
 Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
+#: Fields of `RunConfig` that the fit depends on.
+FIT_OPTIONS = (
+    "body", "keypoints", "pose_prior", "labels", "preset",
+    "lambda_skin", "lambda_outside", "lambda_fit", "lambda_cpl", "lambda_prior", "lambda_shape",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -66,6 +72,24 @@ class RunConfig:
     frame.
     """
 
+    labels: Annotated[str, tyro.conf.arg(metavar="auto|none|DIR")] = "auto"
+    """Skin and cloth: as labelled in the scans' files or told by colour (auto), all cloth (none), or label
+    files in a folder."""
+    preset: Literal["buff", "inria"] | None = None
+    """The paper's own weights for BUFF or INRIA data, instead of ours."""
+    lambda_skin: float | None = None
+    """Weight of E_skin: bare points lie on the body. Ours is 1."""
+    lambda_outside: float | None = None
+    """Weight of E_outside: cloth points do not lie inside the body. Ours is 1."""
+    lambda_fit: float | None = None
+    """Weight of E_fit in fusion and detail: the body stays near its clothes. Ours: see fit/settings.py."""
+    lambda_cpl: float | None = None
+    """Weight of E_cpl: the free-form body keeps to the model. Ours: see fit/settings.py."""
+    lambda_prior: float | None = None
+    """Weight of the pose prior. Ours is 0.001."""
+    lambda_shape: float | None = None
+    """Weight of the shape prior. Ours is 0.001."""
+
     def carve_settings(self) -> dict[str, object]:
         """What the hulls depend on, besides the files' contents."""
         values = self.as_dict()
@@ -81,19 +105,39 @@ class RunConfig:
     def fit_settings(self) -> dict[str, object]:
         """What the fit depends on, besides the hulls."""
         values = self.as_dict()
-        return {k: values[k] for k in ("body", "keypoints", "pose_prior")}
+        return {k: values[k] for k in FIT_OPTIONS}
+
+    def adapted(self, settings: FitSettings | None = None) -> FitSettings:
+        """Settings of the fit with the preset and the lambdas asked for; settings: in place of the usual
+        ones.
+        """
+        from fit.presets import Lambdas, preset, with_lambdas
+        from fit.settings import FitSettings
+
+        settings = FitSettings() if settings is None else settings
+        if self.preset is not None:
+            settings = preset(self.preset, settings)
+        names = ("skin", "outside", "fit", "cpl", "prior", "shape")
+        try:
+            return with_lambdas(settings, Lambdas(**{k: getattr(self, f"lambda_{k}") for k in names}))
+        except ValueError as error:
+            raise UserError(str(error)) from error
 
     def as_dict(self) -> dict[str, object]:
         """JSON-ready values; paths made absolute so that the run folder can be used from anywhere."""
-        return {k: str(v.absolute()) if isinstance(v, Path) else v for k, v in asdict(self).items()}
+        labels = self.labels if self.labels in ("auto", "none") else str(Path(self.labels).absolute())
+        return {k: str(v.absolute()) if isinstance(v, Path) else v for k, v in asdict(self).items()} | {
+            "labels": labels
+        }
 
     @staticmethod
     def from_dict(values: dict[str, object]) -> RunConfig:
         """Inverse of as_dict."""
         paths = {"recording", "out", "calibration", "background", "keypoints", "pose_prior"}
         fields = set(RunConfig.__dataclass_fields__)
-        if set(values) != fields:
-            odd = sorted(fields.symmetric_difference(values))
+        # What an older version did not ask for was as its default is.
+        odd = sorted((set(values) - fields) | ({"recording", "out"} - set(values)))
+        if odd:
             raise UserError(
                 f"run.json: its configuration was written by another version of bodyhull (it differs in "
                 f"{', '.join(odd)}); make the run again in another --out"

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from bodyhull.carving import open_for, refuse_other_input
 from bodyhull.config import RunConfig, digest
 from bodyhull.errors import UserError
+from bodyhull.fit_input import is_of_scans
 from bodyhull.fitting import load_fusion, load_track
 from bodyhull.folder import RunFolder
 from capture.recording import Recording
@@ -35,7 +36,11 @@ def draw_stage(config: RunConfig) -> None:
 
     choose_platform()
     folder = RunFolder(config.out)
-    folder.require_state()
+    if is_of_scans(folder.require_state()):
+        raise UserError(
+            f"{folder.root}: was made from scans, and films need cameras and pictures; look at the bodies in "
+            f"{folder.mesh(0).parent}"
+        )
     track = load_track(folder)
     recording = open_for(config)
     refuse_other_input(folder, recording.fingerprint())

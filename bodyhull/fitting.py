@@ -1,5 +1,5 @@
-"""Stage fit: hulls in; alignments, fusion shape and track out, in the recording's world (paper sections 4.1
-to 4.3).
+"""Stage fit: hulls or scans in; alignments, fusion shape and track out, in the recording's world (paper
+sections 4.1 to 4.3).
 
 Finished frames are kept: an alignment on disk is used again as long as body, settings and hull are the same.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,50 +18,31 @@ from tqdm import tqdm
 
 from bodyhull.config import RunConfig, digest
 from bodyhull.errors import UserError
+from bodyhull.fit_input import input_of, read_frames
 from bodyhull.folder import RunFolder, load_arrays, save_arrays
 from fit.align import Alignment, align_sequence
 from fit.body.model import BodyModel, load_body
 from fit.body.pose_prior import PosePrior
-from fit.closest import Container
-from fit.frames import apply, recording_from_body, scan_in_body_frame
+from fit.frames import apply
 from fit.fuse import FusionShape, fused
 from fit.initialise import PoseFinder
 from fit.settings import FitSettings
+from fit.skin import labelled
 from fit.solver import Fitter
 from fit.state import BodyState
 from fit.thickness import Thickness
 from fit.track import TrackedFrame, posed_vertices, track_sequence
-from hull.hull_file import load_hull
-from hull.mesh_file import load_mesh, save_mesh
+from hull.mesh_file import save_mesh
 from hull.scan import Scan
 
 
-def load_hull_scan(path: Path, n_points: int, seed: int) -> Scan:
-    """An all-cloth scan of the hull in a file, world frame."""
-    return Scan.from_hull(load_hull(path), n_points, seed)
-
-
 def fit_stage(config: RunConfig, settings: FitSettings | None = None) -> None:
-    """Fit the run's hulls. Raises UserError where there is none, or where another body's fit is in the
-    folder."""
-    settings = FitSettings() if settings is None else settings
+    """Fit the run's hulls or scans. Raises UserError where there is none, or where another body's fit is
+    there."""
+    settings = config.adapted(settings)
     folder = RunFolder(config.out)
+    source = input_of(config)
     state = folder.require_state()
-    recording = state.get("recording")
-    hulls = state.get("stages", {}).get("hull", {}).get("frames", {})
-    if not recording or not hulls:
-        raise UserError(
-            f"{folder.root}: there are no hulls to fit; run: bodyhull carve RECORDING --out {folder.root}"
-        )
-    if any(f"{k:06d}" not in hulls for k in recording["frame_ids"]):
-        raise UserError(
-            f"{folder.root}: only {len(hulls)} of {len(recording['frame_ids'])} frames are carved; "
-            f"finish them first: bodyhull carve RECORDING --out {folder.root}"
-        )
-    frame_ids = [k for k in recording["frame_ids"] if hulls[f"{k:06d}"]["status"] != "failed"]
-    if not frame_ids:
-        raise UserError(f"{folder.root}: every frame's hull failed, so there is nothing to fit")
-
     model = load_body(config.body)
     prior = _pose_prior(config.pose_prior)
     settings_key = digest(
@@ -70,10 +52,11 @@ def fit_stage(config: RunConfig, settings: FitSettings | None = None) -> None:
             "pose_prior": prior.content_hash,
             "settings": asdict(settings),
         }
+        | ({"labels": config.labels} if config.labels != "auto" else {})
     )
-    key = digest({"settings": settings_key, "hulls": {f: hulls[f]["volume_m3"] for f in sorted(hulls)}})
+    key = digest({"settings": settings_key, "input": source.print})
     entry = state.get("stages", {}).get("fit", {})
-    if entry.get("key") == key and _finished(folder, recording["frame_ids"]) and not config.overwrite:
+    if entry.get("key") == key and _finished(folder, source.all_ids) and not config.overwrite:
         return
     if entry and entry.get("settings_key") != settings_key and not config.overwrite:
         raise UserError(
@@ -97,18 +80,17 @@ def fit_stage(config: RunConfig, settings: FitSettings | None = None) -> None:
     for note in model.notes:
         tqdm.write(f"body: {note}", file=sys.stderr)
     fitter, finder = Fitter.of(model), PoseFinder.of(model, prior)
-    world_from_body = recording_from_body(np.asarray(recording["up"]))
-    scans = {
-        k: scan_in_body_frame(
-            load_hull_scan(folder.hull(k), settings.n_points, settings.seed), world_from_body
-        )
-        for k in tqdm(frame_ids, desc="read hulls", unit="frame", leave=False)
-    }
-    keypoints = _keypoints(config, frame_ids, world_from_body) if config.keypoints is not None else {}
+    world_from_body = source.world_from_body
+    scans = read_frames(source, settings.n_points, settings.seed)
+    keypoints = _keypoints(config, source.frame_ids, world_from_body) if config.keypoints is not None else {}
     alignments = _align(folder, fitter, finder, scans, keypoints, settings, settings_key, config.overwrite)
     if all(a.status == "failed" for a in alignments):
         raise UserError(f"{folder.root}: no frame could be aligned; {alignments[0].message}")
-    fusion, alignments = fused(fitter, finder, alignments, settings)
+    shares = None
+    if config.labels != "none":
+        scans, shares = labelled(fitter, scans, alignments, settings)
+    _save_labels(folder, shares)
+    fusion, alignments = fused(fitter, finder, alignments, settings, shares)
     _save_fusion(folder, model, fusion, world_from_body)
     with tqdm(total=len(alignments), desc="track", unit="frame") as bar:
         track = track_sequence(
@@ -119,9 +101,9 @@ def fit_stage(config: RunConfig, settings: FitSettings | None = None) -> None:
             scans,
             settings,
             report=lambda frame: bar.update(),
-            container_of=lambda frame_id: _container(folder.hull(frame_id), world_from_body),
+            container_of=source.container,
         )
-    track = [*track, *_without_hull(hulls, fusion)]
+    track = [*track, *_without_scan(source.failed, fusion)]
     track.sort(key=lambda frame: frame.frame_id)
     _save_track(folder, fitter, fusion, track, world_from_body)
     for frame in track:
@@ -142,17 +124,22 @@ def fit_stage(config: RunConfig, settings: FitSettings | None = None) -> None:
     )
 
 
-def _without_hull(hulls: dict[str, Any], fusion: FusionShape) -> list[TrackedFrame]:
-    """The frames whose hull failed: kept in the track, without a pose (NaN), with the hull's own sentence."""
+def _without_scan(failed: dict[int, str], fusion: FusionShape) -> list[TrackedFrame]:
+    """The frames without hull or scan: kept in the track, without a pose (NaN), with the reason."""
     lost = np.full_like(fusion.template, np.nan)
     pose, shift = np.full_like(fusion.joints, np.nan), np.full(3, np.nan)
     return [
-        TrackedFrame(
-            int(name), BodyState(lost, pose, shift, fusion.betas), np.inf, "failed", entry["problems"][-1]
-        )
-        for name, entry in hulls.items()
-        if entry["status"] == "failed"
+        TrackedFrame(frame_id, BodyState(lost, pose, shift, fusion.betas), np.inf, "failed", reason)
+        for frame_id, reason in failed.items()
     ]
+
+
+def _save_labels(folder: RunFolder, shares: Mapping[int, np.ndarray] | None) -> None:
+    """g of every vertex of every alignment, or nothing where all is cloth."""
+    if shares is None:
+        folder.skin.unlink(missing_ok=True)
+    else:
+        save_arrays(folder.skin, frame_ids=np.array(list(shares)), skin_share=np.stack(list(shares.values())))
 
 
 def keypoints_print(folder: Path | None) -> str | None:
@@ -161,12 +148,6 @@ def keypoints_print(folder: Path | None) -> str | None:
         return None
     files = sorted(p for p in folder.rglob("*.json") if p.is_file())
     return digest([(str(p.relative_to(folder)), p.stat().st_size, p.stat().st_mtime_ns) for p in files])
-
-
-def _container(path: Path, world_from_body: np.ndarray) -> Container:
-    """The hull that a frame's body has to stay inside of, in the body's frame."""
-    vertices, faces = load_mesh(path)
-    return Container.of(vertices @ world_from_body[:3, :3], faces)
 
 
 def _pose_prior(path: Path | None) -> PosePrior:

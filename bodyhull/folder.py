@@ -23,6 +23,7 @@ OWN_FILES = (
     "hull/[0-9][0-9][0-9][0-9][0-9][0-9]*.ply",
     "hull/[0-9][0-9][0-9][0-9][0-9][0-9]*.npz",
     "fit/alignments/*.npz",
+    "fit/skin.npz",
     "fit/fusion.npz",
     "fit/fusion.ply",
     "fit/track.npz",
@@ -56,6 +57,11 @@ class RunFolder:
     def alignment(self, frame_id: int) -> Path:
         """Cloth alignment of a frame."""
         return self.root / "fit" / "alignments" / f"{frame_id:06d}.npz"
+
+    @property
+    def skin(self) -> Path:
+        """Which vertices of the alignments are bare, where that is known."""
+        return self.root / "fit" / "skin.npz"
 
     @property
     def fusion_mesh(self) -> Path:

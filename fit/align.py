@@ -45,7 +45,9 @@ class Alignment:
 
 def as_scan_points(scan: Scan) -> ScanPoints:
     """A scan as the objective takes it."""
-    return ScanPoints(scan.points, scan.normals, scan.weight, scan.is_skin)
+    return ScanPoints(
+        scan.points, scan.normals, scan.weight, scan.is_skin if scan.skin_share is None else scan.skin_share
+    )
 
 
 def align_frame(

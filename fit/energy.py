@@ -23,15 +23,45 @@ def geman_mcclure(distance: Float[np.ndarray, "n"], sigma_m: float) -> PerPoint:
 
 
 def huber(distance: Float[np.ndarray, "n"], delta_m: float) -> PerPoint:
-    """Quadratic up to delta, linear beyond (written so that the quadratic part is d^2)."""
+    """Quadratic up to delta (infinite: everywhere), linear beyond (written so that the quadratic part is
+    d^2)."""
     size = np.abs(distance)
+    if np.isinf(delta_m):
+        return size**2, np.ones_like(size)
     energy = np.where(size <= delta_m, size**2, delta_m * (2.0 * size - delta_m))
     return energy, np.minimum(1.0, delta_m / np.maximum(size, 1e-30))
 
 
-def skin(signed_distance: Float[np.ndarray, "n"], sigma_m: float) -> PerPoint:
-    """E_skin: scan points labelled skin lie on the body, on either side (g(s) is applied by the caller)."""
-    return geman_mcclure(signed_distance, sigma_m)
+def skin_share(geodesic_m: Float[np.ndarray, "n"], edge_m: float, width_m: float) -> Float[np.ndarray, "n"]:
+    """g of E_skin: logistic of the geodesic distance to the nearest cloth; one half at `edge_m`, 0 on
+    cloth."""
+    steps = np.clip((edge_m - geodesic_m) / width_m, -50.0, 50.0)
+    return np.where(geodesic_m > 0.0, 1.0 / (1.0 + np.exp(steps)), 0.0)
+
+
+def skin(
+    signed_distance: Float[np.ndarray, "n"], sigma_m: float, g: Float[np.ndarray, "n"] | float = 1.0
+) -> PerPoint:
+    """E_skin: scan points labelled skin lie on the body, on either side, the less surely the nearer cloth
+    is (g)."""
+    energy, weight = geman_mcclure(signed_distance, sigma_m)
+    return g * energy, g * weight
+
+
+def cloth(
+    signed_distance: Float[np.ndarray, "n"],
+    outside_weight: float,
+    outside_m: float,
+    fit_weight: Float[np.ndarray, "n"] | float,
+    sigma_m: float,
+) -> PerPoint:
+    """E_cloth = lambda_outside E_outside + lambda_fit E_fit; lambda_fit may differ from point to point."""
+    out_energy, out_weight = outside(signed_distance, outside_m)
+    fit_energy, fit_pull = fit(signed_distance, sigma_m)
+    return (
+        outside_weight * out_energy + fit_weight * fit_energy,
+        outside_weight * out_weight + fit_weight * fit_pull,
+    )
 
 
 def outside(signed_distance: Float[np.ndarray, "n"], delta_m: float) -> PerPoint:

@@ -166,3 +166,42 @@ def pose_truth_to(
 def inside_share(body: Float[np.ndarray, "v 3"], hull: Surface, tolerance_m: float = 0.001) -> float:
     """Share of the body's vertices that lie outside the hull by more than the tolerance."""
     return float((closest_points(hull.vertices, hull.faces, body).distance > tolerance_m).mean())
+
+
+#: Points less deep than this inside the body touch it.
+TOUCH_M = 0.001
+
+
+@dataclass(frozen=True)
+class Penetration:
+    """share of a scan's points inside the body, and the mean and 95th percentile of their depths, mm (0 if
+    none)."""
+
+    share: float
+    mean_mm: float
+    p95_mm: float
+
+
+def penetration(points: Float[np.ndarray, "n 3"], body: Surface) -> Penetration:
+    """How much of a scan, or hull, lies inside the body where no cloth can be, by more than TOUCH_M.
+
+    points (N 3), m: even in area.
+    """
+    depth = -closest_points(body.vertices, body.faces, points).distance
+    inside = depth[depth > TOUCH_M]
+    if len(inside) == 0:
+        return Penetration(0.0, 0.0, 0.0)
+    return Penetration(
+        len(inside) / len(points), 1e3 * float(inside.mean()), 1e3 * float(np.percentile(inside, 95))
+    )
+
+
+def mean_penetration(frames: list[Penetration]) -> Penetration:
+    """Over frames: the mean share, and depths weighted by it."""
+    share = np.array([p.share for p in frames])
+    weight = share / max(share.sum(), 1e-12)
+    return Penetration(
+        float(share.mean()),
+        float(weight @ [p.mean_mm for p in frames]),
+        float(weight @ [p.p95_mm for p in frames]),
+    )

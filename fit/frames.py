@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 
@@ -33,10 +35,4 @@ def apply(
 def scan_in_body_frame(scan: Scan, recording_from_body: Float[np.ndarray, "4 4"]) -> Scan:
     """The scan as the fitter sees it: y up."""
     rotation = recording_from_body[:3, :3]
-    return Scan(
-        points=scan.points @ rotation,
-        normals=scan.normals @ rotation,
-        faces=scan.faces,
-        is_skin=scan.is_skin,
-        weight=scan.weight,
-    )
+    return replace(scan, points=scan.points @ rotation, normals=scan.normals @ rotation)

@@ -6,7 +6,7 @@ same objective in the zero pose, all points cloth, gives the person's shape.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -95,23 +95,45 @@ def usable(alignments: Sequence[Alignment]) -> list[Alignment]:
 
 
 def fused(
-    fitter: Fitter, finder: PoseFinder, alignments: Sequence[Alignment], settings: FitSettings
+    fitter: Fitter,
+    finder: PoseFinder,
+    alignments: Sequence[Alignment],
+    settings: FitSettings,
+    skin_shares: Mapping[int, Float[np.ndarray, "_v"]] | None = None,
 ) -> tuple[FusionShape, list[Alignment]]:
     """The fusion shape, and the alignments with the poses to track from.
+
+    skin_shares: g of every vertex (V) by frame number, where skin was told from cloth.
 
     Where the clothes' movement can be read, one shape and all poses are found at once; else every frame keeps
     the pose it was aligned with. Raises ValueError when no frame was aligned.
     """
     good = usable(alignments)
-    if not can_be_together(good, trust_in_spread(good, settings)):
-        return fuse(fitter, alignments, settings), list(alignments)
+    if not settings.at_once or not can_be_together(good, trust_in_spread(good, settings)):
+        return fuse(fitter, alignments, settings, skin_shares), list(alignments)
     together = fit_together(fitter, finder, good, settings)
+    if skin_shares is not None:
+        together = replace(
+            together,
+            thickness=undressed(
+                together.thickness, np.mean([skin_shares[a.frame_id] for a in good], axis=0), settings
+            ),
+        )
     again = together.realigned(fitter, good)
     by_frame = {a.frame_id: a for a in again}
     # A suspect frame does not speak for the shape, but it is tracked like the others.
     return (
         fuse_together(fitter, again, together, settings),
         [by_frame.get(a.frame_id, a) for a in alignments],
+    )
+
+
+def undressed(thickness: Thickness, bare: Float[np.ndarray, "v"], settings: FitSettings) -> Thickness:
+    """The clothes' thickness where a share (V) of the surface is known to be bare: there is none on it."""
+    return replace(
+        thickness,
+        expected=(1.0 - bare) * thickness.expected,
+        tolerance=(1.0 - bare) * thickness.tolerance + bare * settings.thickness.tolerance_m,
     )
 
 
@@ -164,10 +186,16 @@ def fuse_together(
     )
 
 
-def fuse(fitter: Fitter, alignments: Sequence[Alignment], settings: FitSettings) -> FusionShape:
+def fuse(
+    fitter: Fitter,
+    alignments: Sequence[Alignment],
+    settings: FitSettings,
+    skin_shares: Mapping[int, Float[np.ndarray, "_v"]] | None = None,
+) -> FusionShape:
     """Estimate the fusion shape from all alignments that did not fail.
 
-    Raises ValueError when there is none.
+    skin_shares: g of every vertex (V) by frame number, where skin was told from cloth. Raises ValueError when
+    there is no such alignment.
     """
     good = usable(alignments)
     templates = np.stack([a.state.template for a in good])
@@ -181,7 +209,9 @@ def fuse(fitter: Fitter, alignments: Sequence[Alignment], settings: FitSettings)
         points,
         np.concatenate([vertex_normals(t, fitter.model.faces) for t in templates]),
         keep.ravel().astype(float),
-        np.zeros(len(points), dtype=bool),
+        np.zeros(len(points))
+        if skin_shares is None
+        else np.concatenate([skin_shares[a.frame_id] for a in good]),
     )
     spread = offsets.std(axis=0)
     enough = len(good) >= ENOUGH_FRAMES
@@ -197,6 +227,7 @@ def fuse(fitter: Fitter, alignments: Sequence[Alignment], settings: FitSettings)
             stage,
             sigma_m=stage.sigma_m * (2.0 - trust),
             coupling=stage.coupling * settings.stiffness(trust),
+            skin=stage.skin * settings.fuse_skin,
             shape_prior=stage.shape_prior * settings.stiffness(trust),
         )
         objective = Objective(

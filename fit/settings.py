@@ -14,8 +14,10 @@ from dataclasses import dataclass, field
 class StageWeights:
     """One objective: which terms, how strong.
 
-    cloth: treat every point as cloth (outside + fit) instead of as skin; sigma_m: Geman-McClure scale
-    of skin or fit; fit: lambda_fit / lambda_outside; outside_m: Huber scale of the outside term;
+    cloth: treat every point that is not labelled skin as cloth (outside + fit) instead of as skin; sigma_m:
+    Geman-McClure scale of skin or fit; skin, outside, fit: lambda_skin, lambda_outside, lambda_fit;
+    boundary_as_cloth: what g takes from a skin point near cloth counts as cloth (the paper lets it go);
+    outside_m: Huber scale of the outside term;
     inside, inside_m, margin_m: weight a vertex, Huber scale and depth to reach of keeping the body
     inside a closed scan; coupling: lambda_cpl; tether: absolute pull of the template to its target;
     pose_prior, shape_prior: of the Gaussian priors; gate: whether points facing away from the body's
@@ -34,6 +36,9 @@ class StageWeights:
     pose_prior: float = 1e-3
     shape_prior: float = 1e-3
     gate: bool = True
+    skin: float = 1.0
+    outside: float = 1.0
+    boundary_as_cloth: bool = True
 
 
 def _fusion_stage(coupling: float) -> StageWeights:
@@ -114,6 +119,8 @@ class FitSettings:
     align_joint: tuple[StageWeights, ...] = (
         StageWeights(cloth=False, sigma_m=0.05, coupling=1.0, tether=1e-2),
     )
+    #: One shape and all poses at once, where the clothes' movement can be read; else the paper's fusion.
+    at_once: bool = True
     thickness: ThicknessSettings = field(default_factory=ThicknessSettings)
     together: TogetherSettings = field(default_factory=TogetherSettings)
     #: Fusion shape, stiff then soft: every vertex of every unposed alignment is a cloth point.
@@ -128,6 +135,11 @@ class FitSettings:
     #: the pose held.
     track_pose: StageWeights = field(default_factory=_track_pose)
     track_template: StageWeights = field(default_factory=_track_template)
+    #: lambda_skin of fusion: bare parts of unposed alignments are some millimetres off.
+    fuse_skin: float = 0.3
+    #: Logistic of the geodesic distance to the nearest cloth: its middle and its width.
+    skin_edge_m: float = 0.03
+    skin_edge_width_m: float = 0.0075
     #: lambda_fit is multiplied by (spread_m / spread)^spread_power a vertex, within these limits.
     spread_m: float = 0.0025
     spread_power: float = 3.0

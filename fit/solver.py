@@ -36,7 +36,7 @@ FIRST_POINTS = 60_000
 @dataclass(frozen=True)
 class ScanPoints:
     """What the objective sees of a scan: points (N 3) m, outward normals (N 3), weight (N), 0 ignores a
-    point."""
+    point; is_skin (N): g of the skin term, 0 (false) for cloth."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
@@ -199,20 +199,20 @@ class Objective:
             # trunk).
             cosine = (self.scan.normals * closest.normals).sum(1)
             scale = scale * np.clip((cosine + 0.2) / 0.6, 0.0, 1.0)
-        skin_energy, skin_weight = terms.skin(d, w.sigma_m)
         if not w.cloth:
-            return scale * skin_energy, scale * skin_weight
-        outside_energy, outside_weight = terms.outside(d, w.outside_m)
-        fit_energy, fit_weight = terms.fit(d, w.sigma_m)
+            energy, weight = terms.skin(d, w.sigma_m)
+            return w.skin * scale * energy, w.skin * scale * weight
         fit = np.full(len(d), w.fit)
         if self.fit_scale is not None:
             corners = self.fitter.model.faces[closest.triangle_idx]
             fit = fit * (closest.barycentric * self.fit_scale[corners]).sum(1)
-        energy = outside_energy + fit * fit_energy
-        weight = outside_weight + fit * fit_weight
+        energy, weight = terms.cloth(d, w.outside, w.outside_m, fit, w.sigma_m)
         if self.scan.is_skin.any():
-            energy = np.where(self.scan.is_skin, skin_energy, energy)
-            weight = np.where(self.scan.is_skin, skin_weight, weight)
+            g = self.scan.is_skin.astype(float)
+            is_cloth = 1.0 - g if w.boundary_as_cloth else g == 0.0
+            skin_energy, skin_weight = terms.skin(d, w.sigma_m, g)
+            energy = w.skin * skin_energy + is_cloth * energy
+            weight = w.skin * skin_weight + is_cloth * weight
         return scale * energy, scale * weight
 
     def difference(self, state: BodyState) -> Float[np.ndarray, "v 3"]:

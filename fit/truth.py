@@ -85,3 +85,26 @@ def load_truth(path: Path, sequence: str = "") -> Truth:
             raise
         raise TruthError(f"{path}: cannot be read as a truth file ({error})") from error
     return Truth(vertices, faces, region, outer, tuple(int(k) for k in frame_ids))
+
+
+@dataclass(frozen=True)
+class ShapeTruth:
+    """A person's shape without a pose: template (V 3) m in the zero pose, joints (J 3), and whose body's
+    vertices they are (content hash)."""
+
+    template: Float[np.ndarray, "v 3"]
+    joints: Float[np.ndarray, "j 3"]
+    body_hash: str
+
+
+def load_shape_truth(path: Path) -> ShapeTruth | None:
+    """The shape that `bodyhull ground-truth` wrote, or None where the file holds posed bodies or is no such
+    file."""
+    path = Path(path)
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
+            if "vertices" in data or not {"template", "joints", "body_hash"} <= set(data.files):
+                return None
+            return ShapeTruth(data["template"], data["joints"], str(data["body_hash"]))
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+        return None

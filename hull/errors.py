@@ -1,4 +1,4 @@
-"""The one exception of this room."""
+"""The exceptions of this room."""
 
 
 class HullError(ValueError):
@@ -7,3 +7,7 @@ class HullError(ValueError):
 
 class EmptyHullError(HullError):
     """Nothing is left of the person; the text names the cameras at fault."""
+
+
+class ScanError(HullError):
+    """A folder or file of scans cannot be used: which, and why."""

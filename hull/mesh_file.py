@@ -105,7 +105,7 @@ def _read(path: Path):  # type: ignore[no-untyped-def]  # open3d ships no types
     if not path.is_file():
         raise MeshFileError(f"there is no mesh file {path}")
     if path.suffix.lower() == ".ply":
-        _check_length(path)
+        require_whole_ply(path)
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         mesh = o3d.io.read_triangle_mesh(path)
     if not len(mesh.triangles):
@@ -115,7 +115,7 @@ def _read(path: Path):  # type: ignore[no-untyped-def]  # open3d ships no types
     return mesh
 
 
-def _check_length(path: Path) -> None:
+def require_whole_ply(path: Path) -> None:
     """Refuse a PLY file that is shorter than its header promises: open3d silently reads what is there."""
     content = path.read_bytes()
     header, mark, body = content.partition(b"end_header\n")

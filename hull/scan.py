@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from hull.visual_hull import Hull
 
@@ -30,6 +30,8 @@ class Scan:
     faces : (F 3) point indices where the points are the vertices of a mesh, else None.
     is_skin : (N,) true where the point is bare skin, false where it is cloth (or hair, or a shoe).
     weight : (N,) how much the point counts; 1 is an ordinary one.
+    colours : (N 3) RGB, or None where nobody took a picture.
+    skin_share : (N,) g of the paper: 0 for cloth, near 1 deep inside a bare region; None: `is_skin` as it is.
     """
 
     points: Float[np.ndarray, "n 3"]
@@ -37,10 +39,16 @@ class Scan:
     faces: Int[np.ndarray, "f 3"] | None
     is_skin: Bool[np.ndarray, " n"]
     weight: Float[np.ndarray, " n"]
+    colours: UInt8[np.ndarray, "n 3"] | None = None
+    skin_share: Float[np.ndarray, " n"] | None = None
 
     @staticmethod
-    def from_hull(hull: Hull, n_points: int | None, seed: int = 0) -> Scan:
-        """An all-cloth scan of `n_points` points, even in area; None: the hull's own vertices and faces.
+    def from_hull(
+        hull: Hull, n_points: int | None, seed: int = 0, is_skin: Bool[np.ndarray, " v"] | None = None
+    ) -> Scan:
+        """A scan of `n_points` points, even in area; None: the hull's own vertices and faces. All cloth,
+        unless
+        `is_skin` labels the hull's vertices.
 
         The same hull, number and seed give the same points. Normals are the vertices', interpolated; weights
         are `trust`, one on average.
@@ -48,7 +56,8 @@ class Scan:
         trusted = trust(hull.slack_m)
         if n_points is None:
             n = len(hull.vertices)
-            return Scan(hull.vertices, hull.normals, hull.faces, np.zeros(n, dtype=bool), trusted)
+            bare = np.zeros(n, dtype=bool) if is_skin is None else is_skin
+            return Scan(hull.vertices, hull.normals, hull.faces, bare, trusted, hull.colours)
         face_idx, barycentric = even_samples(hull.vertices, hull.faces, n_points, seed)
         corners = hull.faces[face_idx]
         points = np.einsum("nk,nki->ni", barycentric, hull.vertices[corners])
@@ -60,7 +69,14 @@ class Scan:
         weight = np.einsum("nk,nk->n", barycentric, trusted[corners])
         # Where all places count alike they do so exactly.
         weight = np.ones(n_points) if (trusted == 1.0).all() else weight / weight.mean()
-        return Scan(points, normals, None, np.zeros(n_points, dtype=bool), weight)
+        bare = np.zeros(n_points, dtype=bool)
+        if is_skin is not None:
+            bare = np.einsum("nk,nk->n", barycentric, is_skin[corners].astype(float)) > 0.5
+        colours = None
+        if hull.colours is not None:
+            mixed = np.einsum("nk,nkc->nc", barycentric, hull.colours[corners].astype(float))
+            colours = np.round(mixed).astype(np.uint8)
+        return Scan(points, normals, None, bare, weight, colours)
 
 
 def trust(slack_m: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:

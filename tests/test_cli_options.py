@@ -13,12 +13,15 @@ from tests.command_line import call
 Capture = pytest.CaptureFixture[str]
 RUN = (
     "RECORDING --out --sequence --body --calibration --frames --voxel-mm --units --up --background "
-    "--keypoints --pose-prior --no-colours --votes --soft --no-find-faults --refine --overwrite"
+    "--keypoints --pose-prior --no-colours --votes --soft --no-find-faults --refine --overwrite "
+)
+FIT = (
+    "--labels --preset --lambda-skin --lambda-outside --lambda-fit --lambda-cpl --lambda-prior --lambda-shape"
 )
 COMMANDS = {
-    "run": RUN,
-    "carve": RUN,
-    "fit": "RUN --body --keypoints --pose-prior --overwrite",
+    "run": RUN + FIT,
+    "carve": RUN + FIT,
+    "fit": "RUN SCANS --out --body --keypoints --pose-prior --frames --units --up --overwrite " + FIT,
     "overlay": "RUN --overwrite",
     "evaluate": "RUN --truth",
     "synth": "OUT --cameras --size --layout --frames --motion --garment --seed --body --overwrite",
