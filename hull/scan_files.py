@@ -212,6 +212,8 @@ def _read_mesh(path: Path) -> _Arrays:
 
     if path.suffix.lower() not in MESHES:
         raise ScanError(f"{path}: scans are {', '.join(SCANS)} files")
+    if path.suffix.lower() == ".obj":
+        return _read_obj(path)
     if path.suffix.lower() == ".ply":
         require_whole_ply(path)
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
@@ -232,6 +234,35 @@ def _read_mesh(path: Path) -> _Arrays:
     shades = np.asarray(cloud.colors if is_cloud else mesh.vertex_colors) if has_colours else None
     colours = None if shades is None else np.round(255.0 * shades).astype(np.uint8)
     return vertices, faces if len(faces) else None, normals, colours, None
+
+
+def _read_obj(path: Path) -> _Arrays:
+    """Vertices in the file's order, which labels follow (open3d sorts them by use), and faces as triangles."""
+    rows: list[list[float]] = []
+    faces: list[list[int]] = []
+    try:
+        for line in path.read_text("ascii", errors="replace").splitlines():
+            words = line.split()
+            if words[:1] == ["v"]:
+                rows.append([float(word) for word in words[1:7]])
+            elif words[:1] == ["f"]:
+                corners = [int(word.split("/")[0]) for word in words[1:]]
+                around = [c - 1 if c > 0 else len(rows) + c for c in corners]
+                faces += [[around[0], b, c] for b, c in zip(around[1:-1], around[2:], strict=True)]
+        values = np.array(rows, dtype=float).reshape(len(rows), -1)
+        triangles = np.array(faces, dtype=np.int64).reshape(-1, 3)
+    except (OSError, ValueError) as error:
+        raise ScanError(f"{path}: cannot be read as a scan ({error})") from error
+    if values.shape[1] not in (3, 6) or triangles.max(initial=-1) >= len(values):
+        raise ScanError(f"{path}: cannot be read as a scan; is it cut short?")
+    colours = values[:, 3:] * (255.0 if values[:, 3:].max(initial=0.0) <= 1.0 else 1.0)
+    return (
+        values[:, :3],
+        triangles if len(triangles) else None,
+        None,
+        np.clip(np.round(colours), 0, 255).astype(np.uint8) if values.shape[1] == 6 else None,
+        None,
+    )
 
 
 def _read_npz(path: Path) -> _Arrays:

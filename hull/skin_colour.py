@@ -34,7 +34,7 @@ _EDGE_COST, _EDGE_COLOUR = 4.0, 8.0
 _LARGEST_COST = 8.0
 #: Mahalanobis distances: a seed within the first is skin; what lies beyond the second is something else for
 #: sure.
-_SURE, _ELSE = 2.5, 6.0
+_SURE, _ELSE = 2.5, 3.5
 _FEWEST = 30
 
 
@@ -48,7 +48,7 @@ def is_skin_tone(tone: Float[np.ndarray, "3"]) -> bool:
     """Whether a Lab colour may be a person's skin, of any complexion."""
     hue = float(np.degrees(np.arctan2(tone[2], tone[1])))
     chroma = float(np.hypot(tone[1], tone[2]))
-    return _HUE_DEG[0] < hue < _HUE_DEG[1] and chroma > _LEAST_CHROMA and tone[0] > _LEAST_LIGHTNESS
+    return _HUE_DEG[0] < hue < _HUE_DEG[1] and chroma > _LEAST_CHROMA and bool(tone[0] > _LEAST_LIGHTNESS)
 
 
 def skin_by_colour(

@@ -21,7 +21,7 @@ FIT = (
 COMMANDS = {
     "run": RUN + FIT,
     "carve": RUN + FIT,
-    "fit": "RUN SCANS --out --body --keypoints --pose-prior --frames --units --up --overwrite " + FIT,
+    "fit": "RUN --out --body --keypoints --pose-prior --frames --units --up --overwrite " + FIT,
     "overlay": "RUN --overwrite",
     "evaluate": "RUN --truth",
     "synth": "OUT --cameras --size --layout --frames --motion --garment --seed --body --overwrite",
