@@ -58,7 +58,7 @@ class Fit:
     """Unit of the scans."""
     up: Up = "auto"
     """Axis of the scans that points up."""
-    labels: Annotated[str | None, tyro.conf.arg(metavar="auto|none|DIR")] = None
+    labels: Annotated[str | None, tyro.conf.arg(metavar="auto|colour|none|DIR")] = None
     """Skin and cloth: as labelled in the scans' files or told by colour (auto), all cloth (none), or label
     files in a folder."""
     preset: Literal["buff", "inria"] | None = None

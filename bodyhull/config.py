@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 Units = Literal["auto", "m", "cm", "mm"]
 Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
+#: What --labels may be besides a folder.
+LABEL_CHOICES = ("auto", "colour", "none")
 #: Fields of `RunConfig` that the fit depends on.
 FIT_OPTIONS = (
     "body", "keypoints", "pose_prior", "labels", "preset",
@@ -72,7 +74,7 @@ class RunConfig:
     frame.
     """
 
-    labels: Annotated[str, tyro.conf.arg(metavar="auto|none|DIR")] = "auto"
+    labels: Annotated[str, tyro.conf.arg(metavar="auto|colour|none|DIR")] = "auto"
     """Skin and cloth: as labelled in the scans' files or told by colour (auto), all cloth (none), or label
     files in a folder."""
     preset: Literal["buff", "inria"] | None = None
@@ -125,7 +127,7 @@ class RunConfig:
 
     def as_dict(self) -> dict[str, object]:
         """JSON-ready values; paths made absolute so that the run folder can be used from anywhere."""
-        labels = self.labels if self.labels in ("auto", "none") else str(Path(self.labels).absolute())
+        labels = self.labels if self.labels in LABEL_CHOICES else str(Path(self.labels).absolute())
         return {k: str(v.absolute()) if isinstance(v, Path) else v for k, v in asdict(self).items()} | {
             "labels": labels
         }

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from bodyhull.config import RunConfig, digest
+from bodyhull.config import LABEL_CHOICES, RunConfig, digest
 from bodyhull.errors import UserError
 from bodyhull.folder import RunFolder
 from capture.frame_choice import choose_frames
@@ -28,33 +28,13 @@ WORLD_FRAMES = 5
 WORLD_POINTS = 4000
 
 
-class FitInput(Protocol):
-    """Scans of a run, in the body's frame.
-
-    all_ids: every frame; frame_ids: those that can be fitted; failed: why not, of the others; print:
-    changes when
-    the scans do.
-    """
-
-    all_ids: list[int]
-    frame_ids: list[int]
-    failed: dict[int, str]
-    print: str
-    world_from_body: np.ndarray
-
-    def scan(self, frame_id: int, n_points: int, seed: int) -> Scan:
-        """Points of a frame."""
-
-    def container(self, frame_id: int) -> Container | None:
-        """The closed surface that contains the person, where there is one."""
-
-
 @dataclass
 class HullInput:
     """The hulls of a carved run."""
 
     folder: RunFolder
     labels: Path | None
+    by_colour: bool
     all_ids: list[int]
     frame_ids: list[int]
     failed: dict[int, str]
@@ -66,7 +46,8 @@ class HullInput:
         path = self.folder.hull(frame_id)
         hull = load_hull(path)
         is_skin = None if self.labels is None else read_labels(path, len(hull.vertices), self.labels)
-        return scan_in_body_frame(Scan.from_hull(hull, n_points, seed, is_skin), self.world_from_body)
+        scan = scan_in_body_frame(Scan.from_hull(hull, n_points, seed, is_skin), self.world_from_body)
+        return scan if self.by_colour else replace(scan, colours=None)
 
     def container(self, frame_id: int) -> Container:
         """The hull: it contains the person by construction."""
@@ -96,6 +77,12 @@ class FilesInput:
         """Scans have holes: nothing is known to contain the person."""
 
 
+#: Scans of a run in the body's frame. all_ids: every frame; frame_ids: those that can be fitted; failed:
+#: why not,
+#: of the others; print: changes when the scans do.
+FitInput = HullInput | FilesInput
+
+
 def is_of_scans(state: dict[str, Any]) -> bool:
     """Whether a run was made from scans instead of silhouettes."""
     return bool(state.get("inputs", {}).get("kind") == "scans")
@@ -103,12 +90,13 @@ def is_of_scans(state: dict[str, Any]) -> bool:
 
 def labels_folder(config: RunConfig) -> Path | None:
     """The folder that --labels names, if it names one. Raises UserError where there is none."""
-    if config.labels in ("auto", "none"):
+    if config.labels in LABEL_CHOICES:
         return None
     folder = Path(config.labels)
     if not folder.is_dir():
         raise UserError(
-            f"--labels {config.labels}: give auto, none, or a folder of label files; there is none there"
+            f"--labels {config.labels}: give auto, colour, none, or a folder of label files; there "
+            f"is none there"
         )
     return folder
 
@@ -150,6 +138,7 @@ def input_of(config: RunConfig) -> FitInput:
     return HullInput(
         folder,
         labels,
+        config.labels == "colour",
         recording["frame_ids"],
         frame_ids,
         {int(k): entry["problems"][-1] for k, entry in hulls.items() if entry["status"] == "failed"},

@@ -17,6 +17,7 @@ import re
 import zipfile
 from dataclasses import dataclass, replace
 from hashlib import sha256
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -237,7 +238,8 @@ def _read_mesh(path: Path) -> _Arrays:
 
 
 def _read_obj(path: Path) -> _Arrays:
-    """Vertices in the file's order, which labels follow (open3d sorts them by use), and faces as triangles."""
+    """Vertices in the file's order, which labels follow (open3d sorts them by use), and faces as
+    triangles."""
     rows: list[list[float]] = []
     faces: list[list[int]] = []
     try:
@@ -248,7 +250,7 @@ def _read_obj(path: Path) -> _Arrays:
             elif words[:1] == ["f"]:
                 corners = [int(word.split("/")[0]) for word in words[1:]]
                 around = [c - 1 if c > 0 else len(rows) + c for c in corners]
-                faces += [[around[0], b, c] for b, c in zip(around[1:-1], around[2:], strict=True)]
+                faces += [[around[0], b, c] for b, c in pairwise(around[1:])]
         values = np.array(rows, dtype=float).reshape(len(rows), -1)
         triangles = np.array(faces, dtype=np.int64).reshape(-1, 3)
     except (OSError, ValueError) as error:

@@ -1,4 +1,5 @@
-"""Scans in files: every format gives the same points, clouds get outward normals, labels and errors are told."""
+"""Scans in files: every format gives the same points, clouds get outward normals, labels and errors are
+told."""
 
 from pathlib import Path
 
@@ -49,7 +50,7 @@ def test_inward_faces_are_turned(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ending", [".ply", ".npz"])
 def test_a_point_cloud_gets_outward_normals_and_even_weights(ending: str, tmp_path: Path) -> None:
-    vertices, faces = ball(50)
+    vertices, _ = ball(50)
     points = vertices[np.unique(np.round(vertices, 6), axis=0, return_index=True)[1]]
     path = tmp_path / f"c7{ending}"
     if ending == ".npz":
