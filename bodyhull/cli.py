@@ -98,6 +98,18 @@ class Evaluate:
 
 
 @dataclass(frozen=True)
+class GroundTruth:
+    """The true shape of a person from a sequence in minimal clothing: the mean of its alignments."""
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCANS|RUN")]
+    """Folder of scans, or a run that was fitted."""
+    out: Annotated[Path, tyro.conf.arg(metavar="TRUTH.npz")]
+    """File to write; `bodyhull evaluate --truth` takes it."""
+    body: str | None = None
+    """Body model: free:neutral, free:female, free:male, or a path."""
+
+
+@dataclass(frozen=True)
 class Synth:
     """Film a clothed synthetic person with a synthetic rig: a recording in the INRIA layout, with the
     truth."""
@@ -146,6 +158,7 @@ class Demo:
 Command = (
     Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Synth, tyro.conf.subcommand("synth")]
+    | Annotated[GroundTruth, tyro.conf.subcommand("ground-truth")]
     | Annotated[Carve, tyro.conf.subcommand("carve")]
     | Annotated[Fit, tyro.conf.subcommand("fit")]
     | Annotated[Overlay, tyro.conf.subcommand("overlay")]
@@ -238,6 +251,14 @@ def perform(command: object) -> int:
             return OK
         case Evaluate():
             return evaluate(command)
+        case GroundTruth():
+            from bodyhull.ground_truth import write_ground_truth
+
+            made = write_ground_truth(command.source, command.out, command.body)
+            print(
+                f"shape: {made.path}   mean of {made.n_frames} frames, {made.spread_mm:.1f} mm RMS around it"
+            )
+            return OK
         case Synth():
             return synthesise(command)
         case Body():

@@ -24,6 +24,7 @@ COMMANDS = {
     "fit": "RUN --out --body --keypoints --pose-prior --frames --units --up --overwrite " + FIT,
     "overlay": "RUN --overwrite",
     "evaluate": "RUN --truth",
+    "ground-truth": "--out --body",
     "synth": "OUT --cameras --size --layout --frames --motion --garment --seed --body --overwrite",
     "body info": "FILE",
     "body convert": "FILE OUT.npz --overwrite",
