@@ -91,6 +91,8 @@ def fit_together(
     The thickness is estimated anew every round from the same residuals. Shapes have to explain all frames, so
     at most `shape_frames` of them (evenly spread) take part in finding the betas; the others' poses follow.
     """
+    from threadpoolctl import threadpool_limits
+
     weights = settings.together
     posed = np.stack([fitter.posed(a.state) for a in alignments])
     cloth = _Cloth(posed, np.stack([vertex_normals(v, fitter.model.faces) for v in posed]))
@@ -104,17 +106,19 @@ def fit_together(
     rest = np.setdiff1d(np.arange(n), chosen)
     energies: list[float] = []
     thickness = None
-    for _ in range(weights.rounds):
-        thickness, energy, moved = _round(fitter, finder, cloth, at, chosen, settings, None)
-        energies.append(energy)
-        if moved < weights.rest:
-            break
-    assert thickness is not None, "at least one round"
-    for k in rest:
+    # The matrices are small: threads would only fight over them.
+    with threadpool_limits(limits=1, user_api="blas"):
         for _ in range(weights.rounds):
-            _, _, moved = _round(fitter, finder, cloth, at, np.array([k]), settings, thickness)
+            thickness, energy, moved = _round(fitter, finder, cloth, at, chosen, settings, None)
+            energies.append(energy)
             if moved < weights.rest:
                 break
+        assert thickness is not None, "at least one round"
+        for k in rest:
+            for _ in range(weights.rounds):
+                _, _, moved = _round(fitter, finder, cloth, at, np.array([k]), settings, thickness)
+                if moved < weights.rest:
+                    break
     return Together(at.poses, at.translations, at.betas, thickness, tuple(energies))
 
 
@@ -248,7 +252,8 @@ def _by_betas(
     cross = np.zeros((n_pose + 3, n_betas))
     if not n_betas:
         return cross, np.zeros((0, 0)), np.zeros(0)
-    moves = np.empty((len(used), n_betas))
+    # Single precision: many rows, summed up into a matrix that a prior keeps well conditioned.
+    moves = np.empty((len(used), n_betas), dtype=np.float32)
     offsets = fitter.shape.offsets_by_betas(pose).reshape(-1, 3, n_betas)
     compiled_skin.betas_along_normals(
         used,
@@ -260,9 +265,11 @@ def _by_betas(
         offsets,
         moves,
     )
-    root = np.sqrt(weight)
+    root = np.sqrt(weight).astype(np.float32)
     rooted = moves * root[:, None]
+    rhs = (moves.T @ (weight * residual).astype(np.float32)).astype(np.float64)
+    moves *= weight[:, None].astype(np.float32)
     compiled_skin.pose_by_columns(
-        used, normals, at.ptr, at.joint, body.blocks, moves * weight[:, None], cross[:n_pose], cross[n_pose:]
+        used, normals, at.ptr, at.joint, body.blocks, moves, cross[:n_pose], cross[n_pose:]
     )
-    return cross, rooted.T @ rooted, rooted.T @ (root * residual)
+    return cross, (rooted.T @ rooted).astype(np.float64), rhs
