@@ -1,8 +1,8 @@
 """`bodyhull ground-truth`: a person's true shape from a sequence in minimal clothing (paper section 5.2.1).
 
 Every frame is registered with all its points as skin, which is what a cloth alignment is; the mean of the
-unposed
-templates is the shape. `bodyhull evaluate --truth` takes it by the paper's protocol: posed to the result.
+unposed templates is the shape. `bodyhull evaluate --truth` takes it by the paper's protocol: posed to the
+result.
 """
 
 from __future__ import annotations
@@ -33,8 +33,7 @@ def write_ground_truth(source: Path, out: Path, body: str | None = None) -> True
     """The shape in `out` (.npz) of a folder of scans, or of a run that holds a fit.
 
     Scans are fitted in a run folder beside `out`, `<name>-run`, whose finished frames are kept. Raises
-    UserError
-    where nothing can be aligned, or where the run's fit is of another body.
+    UserError where nothing can be aligned, or where the run's fit is of another body.
     """
     if out.suffix != ".npz":
         raise UserError(f"--out {out}: the shape is written as an .npz file")

@@ -10,8 +10,7 @@ from scipy.sparse.csgraph import dijkstra
 
 def edge_lengths(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> csr_matrix:
     """(V V) lengths of a mesh's edges, m; besides them, of the way across each pair of triangles with a
-    common
-    edge, without which paths along edges are a tenth too long."""
+    common edge, without which paths along edges are a tenth too long."""
     corners = np.concatenate([faces, faces[:, [1, 2, 0]], faces[:, [2, 0, 1]]])
     low, high = corners[:, :2].min(1), corners[:, :2].max(1)
     order = np.lexsort([high, low])

@@ -21,8 +21,7 @@ class Lambdas:
     """Weights that replace those of `FitSettings`; None leaves one as it is.
 
     cpl is also the end of the fusion, which starts stiffer. fit is that of fusion and detail: the tracked
-    pose
-    takes cloth as skin. With fit or skin given, the paper's fusion is made, whose weights they are.
+    pose takes cloth as skin. With fit or skin given, the paper's fusion is made, whose weights they are.
     """
 
     skin: float | None = None
@@ -73,8 +72,7 @@ def with_lambdas(settings: FitSettings, lambdas: Lambdas) -> FitSettings:
 
 def preset(name: str, settings: FitSettings | None = None) -> FitSettings:
     """The paper's own objective: its lambdas, the square outside, one lambda_fit for all regions, nothing
-    that hulls
-    know, skin that ends at its edge. Raises KeyError for an unknown name."""
+    that hulls know, skin that ends at its edge. Raises KeyError for an unknown name."""
     found = with_lambdas(FitSettings() if settings is None else settings, PRESETS[name])
 
     def plain(stage: StageWeights) -> StageWeights:

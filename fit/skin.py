@@ -1,6 +1,5 @@
 """Which points are bare skin, and how surely: labels given with the scans, or told by colour, and the g of
-the paper's
-skin term (section 4.1).
+the paper's skin term (section 4.1).
 
 Labels are carried to the alignment, since there the surface is whole and its parts are known; g comes from
 distances along it and goes back to the scan's points by nearest distance.
@@ -37,9 +36,8 @@ def labelled(
 ) -> tuple[dict[int, Scan], Shares | None]:
     """The scans with their skin labelled, and g of every vertex (V) of every alignment, by frame number.
 
-    Labels that the scans bring come first; else colours decide, where all scans have any. None, and the
-    scans as
-    they are, where neither shows skin. A frame whose alignment failed stays all cloth.
+    Labels that the scans bring come first; else colours decide, where all scans have any. None, and the scans
+    as they are, where neither shows skin. A frame whose alignment failed stays all cloth.
     """
     usable = [a for a in alignments if a.status != "failed" and a.frame_id in scans]
     if not usable:

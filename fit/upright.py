@@ -1,8 +1,7 @@
 """Unit and up axis of scans, which their files leave open.
 
-The unit follows from the size of a person. For the axis the body itself is asked: it is fitted coarsely
-with every
-likely axis as up, both ways round, and the one in which it fits best is up.
+The unit follows from the size of a person. For the axis the body itself is asked: it is fitted coarsely with
+every likely axis as up, both ways round, and the one in which it fits best is up.
 """
 
 from __future__ import annotations

@@ -1,14 +1,10 @@
 """Scans in files: one PLY, OBJ, OFF or NPZ a frame, a mesh or a point cloud, with colours and labels where
-there are
-any.
+there are any.
 
-Beside a scan `walk.000012.ply` its labels may lie in `walk.000012.labels.npy`, `.labels.txt` or
-`.labels.npz` (array
-`labels`): one number a vertex, in the file's order, 1 for skin and 0 for cloth, hair or shoes. An NPZ scan
-holds
-`vertices` (or `points`, `pts`), and if it has them `faces`, `normals`, `colours` (or `colors`; 0 to 255, or
-0 to 1) and
-`labels`.
+Beside a scan `walk.000012.ply` its labels may lie in `walk.000012.labels.npy`, `.labels.txt` or `.labels.npz`
+(array `labels`): one number a vertex, in the file's order, 1 for skin and 0 for cloth, hair or shoes. An NPZ
+scan holds `vertices` (or `points`, `pts`), and if it has them `faces`, `normals`, `colours` (or `colors`; 0
+to 255, or 0 to 1) and `labels`.
 """
 
 from __future__ import annotations
@@ -42,8 +38,7 @@ _PRINTED_BYTES = 1 << 16
 @dataclass(frozen=True, eq=False)
 class ScanFile:
     """A scan as its file gives it: vertices (V 3), faces (F 3) or None for a cloud, outward unit normals (V
-    3),
-    colours (V 3) RGB or None, is_skin (V) or None where nobody labelled it."""
+    3), colours (V 3) RGB or None, is_skin (V) or None where nobody labelled it."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"] | None
@@ -56,9 +51,8 @@ class ScanFile:
         return replace(self, vertices=factor * self.vertices)
 
     def sampled(self, n_points: int, seed: int = 0) -> Scan:
-        """A scan of `n_points` points, even in area; of a cloud at most its own points, weighted by the
-        area that
-        each stands for. The same file, number and seed give the same points."""
+        """A scan of `n_points` points, even in area; of a cloud at most its own points, weighted by the area
+        that each stands for. The same file, number and seed give the same points."""
         if self.faces is not None:
             face_idx, barycentric = even_samples(self.vertices, self.faces, n_points, seed)
             corners = self.faces[face_idx]
@@ -138,8 +132,7 @@ def read_scan(path: Path, labels: Path | None = None) -> ScanFile:
     """One scan in the file's own unit. labels: folder to find its labels in; None: beside the file.
 
     Normals come from the faces, else from the file, else from the neighbourhood, and are turned outwards.
-    Raises
-    ScanError or MeshFileError: unreadable, cut short, too few points, labels that do not fit.
+    Raises ScanError or MeshFileError: unreadable, cut short, too few points, labels that do not fit.
     """
     path = Path(path)
     read = _read_npz if path.suffix.lower() == ".npz" else _read_mesh

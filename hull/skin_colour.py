@@ -1,13 +1,10 @@
 """Skin told from cloth by colour: a colour model grown from places that are usually bare, then a smooth
-labelling of
-the surface.
+labelling of the surface.
 
 Mixtures of Gaussians of skin and of everything else, over lightness (which light and shade change, so it
-counts
-half) and the two opponent colours of CIE Lab, are fitted in turns with the labels, as interactive picture
-segmentation does; a minimum cut gives the labels that agree with both and change seldom between neighbours
-of one
-colour.
+counts half) and the two opponent colours of CIE Lab, are fitted in turns with the labels, as interactive
+picture segmentation does; a minimum cut gives the labels that agree with both and change seldom between
+neighbours of one colour.
 """
 
 from __future__ import annotations
