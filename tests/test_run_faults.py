@@ -134,12 +134,12 @@ def test_how_often_is_often() -> None:
 
 
 def test_too_many_wrong_make_the_frame_suspect(recording: Path, capsys: Capture) -> None:
-    """The hull is kept, the cameras are named, and the exit code says it; a resumed run says it again."""
+    """The hull is kept, the cameras are named, and the terminal says it; a resumed run says it again."""
     for camera_idx in range(0, 10, 2):
         change(recording, camera_idx, 1, "moved")
     for _ in range(2):
         said = carve(capsys, recording)
-        assert said.code == 3
+        assert said.code == 0, "the hull is there, and may be all that such a rig gives"
         assert "1 of 3 frames have a hull that is not to be trusted (see their problems" in said.err
         assert said.err.rstrip().endswith("in run.json): 000001")
     frame = hull_stage(recording)["000001"]
