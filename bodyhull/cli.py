@@ -276,10 +276,10 @@ def perform(command: object) -> int:
 
 def configuration_of(root: Path, overwrite: bool = False, **changes: object) -> RunConfig:
     """The configuration that a run folder was made with, with the changes asked for (None: none)."""
-    folder = RunFolder(root) state = folder.require_state() config =
-    dataclasses.replace(RunConfig.from_dict(state["configuration"]), out=root, overwrite=overwrite) return
-    dataclasses.replace(config, **{k: v for k, v in changes.items() if v is not None})  # type:
-    ignore[arg-type]
+    folder = RunFolder(root)
+    state = folder.require_state()
+    config = dataclasses.replace(RunConfig.from_dict(state["configuration"]), out=root, overwrite=overwrite)
+    return dataclasses.replace(config, **{k: v for k, v in changes.items() if v is not None})  # type: ignore[arg-type]
 
 
 def fit(command: Fit) -> int:
@@ -319,8 +319,7 @@ def fit(command: Fit) -> int:
 
 
 def frames_code(root: Path, stage: str) -> int:
-    """Exit code after a stage: 3 where frames failed. Failed frames and suspect hulls are named in a
-    sentence.
+    """Exit code after a stage, 3 where frames failed; they and suspect hulls are named in a sentence.
 
     A suspect hull alone is no failure: real rigs that are a degree off have nothing else, and give a body.
     """
