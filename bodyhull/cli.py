@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -274,12 +274,12 @@ def perform(command: object) -> int:
     raise AssertionError(f"no such command: {command!r}")
 
 
-def configuration_of(root: Path, overwrite: bool = False, **changes: object) -> RunConfig:
+def configuration_of(root: Path, overwrite: bool = False, **changes: Any) -> RunConfig:
     """The configuration that a run folder was made with, with the changes asked for (None: none)."""
     folder = RunFolder(root)
     state = folder.require_state()
     config = dataclasses.replace(RunConfig.from_dict(state["configuration"]), out=root, overwrite=overwrite)
-    return dataclasses.replace(config, **{k: v for k, v in changes.items() if v is not None})  # type: ignore[arg-type]
+    return dataclasses.replace(config, **{k: v for k, v in changes.items() if v is not None})
 
 
 def fit(command: Fit) -> int:

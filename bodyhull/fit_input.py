@@ -77,9 +77,8 @@ class FilesInput:
         """Scans have holes: nothing is known to contain the person."""
 
 
-#: Scans of a run in the body's frame. all_ids: every frame; frame_ids: those that can be fitted; failed:
-#: why not,
-#: of the others; print: changes when the scans do.
+#: Scans of a run in the body's frame. all_ids: every frame; frame_ids: those that can be fitted; failed: why
+#: not, of the others; print: changes when the scans do.
 FitInput = HullInput | FilesInput
 
 

@@ -9,25 +9,17 @@ stale.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import numpy as np
-from numba import njit
+
+from hull.kernel import kernel
 
 _CONTACT_M = 1e-4  # as closest.CONTACT_M
 _DEEPEST = 64
 
 
-def _kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    try:
-        return njit(cache=True, nogil=True, error_model="numpy")(function)
-    except RuntimeError:
-        # Nowhere to keep it: compiled once a process.
-        return njit(nogil=True, error_model="numpy")(function)
-
-
-@_kernel
+@kernel
 @no_type_check
 def pack_triangles(vertices, faces, order, corners):
     """Corners (F 9) of the triangles in the tree's order."""
@@ -38,7 +30,7 @@ def pack_triangles(vertices, faces, order, corners):
                 corners[k, 3 * c + a] = vertices[v, a]
 
 
-@_kernel
+@kernel
 @no_type_check
 def fit_boxes(corners, first, boxes):
     """Boxes (2 L - 1, 6) of a complete binary tree whose leaf l holds triangles first[l] to first[l + 1]."""
@@ -59,7 +51,7 @@ def fit_boxes(corners, first, boxes):
             boxes[node, 3 + a] = max(boxes[left, 3 + a], boxes[right, 3 + a])
 
 
-@_kernel
+@kernel
 @no_type_check
 def _box_distance(boxes, node, x, y, z):
     dx = max(boxes[node, 0] - x, 0.0, x - boxes[node, 3])
@@ -68,7 +60,7 @@ def _box_distance(boxes, node, x, y, z):
     return dx * dx + dy * dy + dz * dz
 
 
-@_kernel
+@kernel
 @no_type_check
 def _on_triangle(corners, k, px, py, pz):
     """Squared distance and the second and third barycentric weight of the closest point of triangle k.
@@ -109,7 +101,7 @@ def _on_triangle(corners, k, px, py, pz):
     return ex * ex + ey * ey + ez * ez, s, t
 
 
-@_kernel
+@kernel
 @no_type_check
 def find_closest(points, corners, first, boxes, order, place, guess, triangle, barycentric):
     """Nearest triangle and barycentric weights of every point; guess: a triangle to start from, or -1."""
@@ -154,7 +146,7 @@ def find_closest(points, corners, first, boxes, order, place, guess, triangle, b
         barycentric[i, 1], barycentric[i, 2] = best_s, best_t
 
 
-@_kernel
+@kernel
 @no_type_check
 def sum_face_normals(vertices, faces, total):
     """Vertex normals (V 3), not yet of unit length: the sum of the faces', weighted by area."""
@@ -170,7 +162,7 @@ def sum_face_normals(vertices, faces, total):
             total[v, 2] += nz
 
 
-@_kernel
+@kernel
 @no_type_check
 def measure(points, vertices, faces, normals, triangle, barycentric, foot, normal, distance, direction):
     """Foot points, normals there, signed distances and their directions, as `Container.closest` has them."""
@@ -200,7 +192,7 @@ def measure(points, vertices, faces, normals, triangle, barycentric, foot, norma
                 direction[i, a] = (points[i, a] - foot[i, a]) / distance[i]
 
 
-@_kernel
+@kernel
 @no_type_check
 def sum_normal_equations(
     faces, face_edges, triangle, barycentric, distance, direction, weight, share, own, between, lumped, rhs

@@ -9,22 +9,14 @@ stale.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import numpy as np
-from numba import njit
+
+from hull.kernel import kernel, loose_kernel
 
 
-def _kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    try:
-        return njit(cache=True, nogil=True, error_model="numpy")(function)
-    except RuntimeError:
-        # Nowhere to keep it: compiled once a process.
-        return njit(nogil=True, error_model="numpy")(function)
-
-
-@_kernel
+@kernel
 @no_type_check
 def pose_vertices(
     template, bone_idx, bone_weight, pairs, pair_joint, correctives, features, world, offsets, corrected,
@@ -57,7 +49,7 @@ def pose_vertices(
             posed[v, a] = at
 
 
-@_kernel
+@kernel
 @no_type_check
 def pose_blocks(
     corrected, turned, bone_idx, bone_weight, correctives, world, offsets, posed_joints, axes, d_features,
@@ -106,7 +98,7 @@ def pose_blocks(
                         blocks[n, a, e] += turned[v, a, 0] * mx + turned[v, a, 1] * my + turned[v, a, 2] * mz
 
 
-@_kernel
+@kernel
 @no_type_check
 def moved_by(
     turned, ptr, joint, blocks, bone_idx, bone_weight, by_template, by_pose, by_shift, by_bones, out
@@ -133,7 +125,7 @@ def moved_by(
         out[v, 0], out[v, 1], out[v, 2] = x, y, z
 
 
-@_kernel
+@kernel
 @no_type_check
 def gathered(
     turned, ptr, joint, blocks, bone_idx, bone_weight, force, on_template, on_pose, on_shift, on_bones
@@ -156,7 +148,7 @@ def gathered(
             on_bones[j, 2] += w * z
 
 
-@_kernel
+@kernel
 @no_type_check
 def times_mesh_matrix(edges, own, between, x, out):
     """out = H x for the symmetric blocks of vertices (V 6) and edges (E 6)."""
@@ -179,7 +171,7 @@ def times_mesh_matrix(edges, own, between, x, out):
         out[j, 2] += xz * p + yz * q + zz * r
 
 
-@_kernel
+@kernel
 @no_type_check
 def add_coupling(edges, strength, tether, x, out):
     """out += (L + tether) x, with L of the edges' strengths."""
@@ -194,7 +186,7 @@ def add_coupling(edges, strength, tether, x, out):
             out[j, a] -= pull
 
 
-@_kernel
+@kernel
 @no_type_check
 def dense_of_moves(lumped, ptr, joint, blocks, bone_idx, bone_weight, with_bones, out):
     """J^T H J over pose (3 J), translation (3), bone offsets (3 J); H = lumped. Its upper triangle."""
@@ -254,7 +246,7 @@ def dense_of_moves(lumped, ptr, joint, blocks, bone_idx, bone_weight, with_bones
                                     out[to + e, over + a] += u * h[e, a]
 
 
-@_kernel
+@kernel
 @no_type_check
 def shape_moves(turned, shape, bone_idx, bone_weight, by_bones, out):
     """out (V 3 B): how betas move posed vertices, through template (V 3 B) and bone offsets (J 3 B)."""
@@ -271,7 +263,7 @@ def shape_moves(turned, shape, bone_idx, bone_weight, by_bones, out):
                         out[v, a, b] += w * by_bones[j, a, b]
 
 
-@_kernel
+@kernel
 @no_type_check
 def weighted_moves(lumped, moves, out):
     """out (V 3 B) = lumped blocks times moves (V 3 B)."""
@@ -283,7 +275,7 @@ def weighted_moves(lumped, moves, out):
             out[v, 2, b] = lumped[v, 2] * x + lumped[v, 4] * y + lumped[v, 5] * z
 
 
-@_kernel
+@kernel
 @no_type_check
 def gathered_columns(ptr, joint, blocks, columns, on_pose, on_shift):
     """on_pose (3 J, B) and on_shift (3, B) of many forces (V 3 B) at once."""
@@ -300,15 +292,7 @@ def gathered_columns(ptr, joint, blocks, columns, on_pose, on_shift):
                     on_pose[row, b] += x * columns[v, 0, b] + y * columns[v, 1, b] + z * columns[v, 2, b]
 
 
-def _loose_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Sums may be taken in any order: for what only steers an iteration."""
-    try:
-        return njit(cache=True, nogil=True, error_model="numpy", fastmath=True)(function)
-    except RuntimeError:
-        return njit(nogil=True, error_model="numpy", fastmath=True)(function)
-
-
-@_loose_kernel
+@loose_kernel
 @no_type_check
 def both_ways(matrix, right, left, product, transposed):
     """product (W) = matrix right and transposed (B) = matrix^T left, reading the matrix (W B) once."""
@@ -325,7 +309,7 @@ def both_ways(matrix, right, left, product, transposed):
         product[row] = total
 
 
-@_kernel
+@kernel
 @no_type_check
 def betas_along_normals(used, normals, turned, shape, bone_idx, bone_weight, by_bones, out):
     """out (N B): how far the used vertices go along their normals (V 3) with the betas, as `shape_moves`."""
@@ -347,7 +331,7 @@ def betas_along_normals(used, normals, turned, shape, bone_idx, bone_weight, by_
                         out[i, b] += w * by_bones[bone_idx[v, k], c, b]
 
 
-@_kernel
+@kernel
 @no_type_check
 def pose_by_columns(used, normals, ptr, joint, blocks, columns, on_pose, on_shift):
     """on_pose (3 J, B), on_shift (3, B): moves along normals by pose and translation, times columns (N B)."""

@@ -153,7 +153,7 @@ def fuse_together(
     expected = clothed.mean(0) - together.thickness.expected[:, None] * normals
     certainty = (settings.thickness.tolerance_m / together.thickness.tolerance) ** 2
     offsets = np.einsum("tva,va->tv", clothed - clothed.mean(0), normals)
-    keep = ~lost_points(offsets) if n >= ENOUGH_FRAMES else np.ones(offsets.shape, dtype=bool)
+    keep = ~lost_points(offsets)
     # Both terms are means over their points times the number of vertices, whatever the number of frames.
     scan = ScanPoints(
         np.concatenate([clothed.reshape(-1, 3), expected]),

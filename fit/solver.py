@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix
 
 from fit import energy as terms
@@ -23,7 +23,6 @@ from fit.settings import StageWeights
 from fit.shape_operators import ShapeOperators
 from fit.state import BodyState
 from fit.steps import Linearised, Steps
-from fit.surface import vertex_normals
 
 #: Radians: a joint that turns farther in one step has left the region where the linearisation means anything.
 LARGEST_ROTATION = 0.5
@@ -325,19 +324,3 @@ def minimise(
                 if damping > 1e4:
                     return Outcome(state, tuple(energies), True)
     return Outcome(state, tuple(energies), False)
-
-
-def scan_points(points: np.ndarray, normals: np.ndarray | None = None) -> ScanPoints:
-    """All-cloth points of weight one; normals default to zeros (which the gate must then not use)."""
-    n = len(points)
-    return ScanPoints(
-        points,
-        np.zeros((n, 3)) if normals is None else normals,
-        np.ones(n),
-        np.zeros(n, dtype=bool),
-    )
-
-
-def mesh_as_scan(vertices: np.ndarray, faces: np.ndarray) -> ScanPoints:
-    """The vertices of a mesh with their normals."""
-    return scan_points(vertices, vertex_normals(vertices, faces))

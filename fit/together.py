@@ -69,10 +69,13 @@ class _Frames:
 
 @dataclass(frozen=True)
 class _Cloth:
-    """The posed alignments: vertices and normals (T V 3)."""
+    """The posed alignments: vertices and normals (T V 3); part_weight, ratio (V): how much a vertex's part
+    counts, and `thickness_per_movement`."""
 
     vertices: Float[np.ndarray, "t v 3"]
     normals: Float[np.ndarray, "t v 3"]
+    part_weight: Float[np.ndarray, "v"]
+    ratio: Float[np.ndarray, "v"]
 
 
 def can_be_together(alignments: Sequence[Alignment], trust: float) -> bool:
@@ -95,7 +98,12 @@ def fit_together(
 
     weights = settings.together
     posed = np.stack([fitter.posed(a.state) for a in alignments])
-    cloth = _Cloth(posed, np.stack([vertex_normals(v, fitter.model.faces) for v in posed]))
+    cloth = _Cloth(
+        posed,
+        np.stack([vertex_normals(v, fitter.model.faces) for v in posed]),
+        np.where(np.isin(region_of_vertices(fitter.model), VAGUE_PARTS), VAGUE_WEIGHT, 1.0),
+        thickness_per_movement(fitter.model),
+    )
     at = _Frames(
         np.stack([a.state.pose for a in alignments]),
         np.stack([a.state.translation for a in alignments]),
@@ -148,10 +156,7 @@ def _round(
     if thickness is None:
         noise = bending_noise(model, at.poses[chosen], vertex_normals(template, model.faces))
         offsets = np.stack([f[2] for f in frames])
-        thickness = expected_thickness(
-            offsets, noise, thickness_per_movement(model), model.faces, settings.thickness
-        )
-    part_weight = np.where(np.isin(region_of_vertices(model), VAGUE_PARTS), VAGUE_WEIGHT, 1.0)
+        thickness = expected_thickness(offsets, noise, cloth.ratio, model.faces, settings.thickness)
     n_betas = 0 if held is not None else model.n_betas
     shape_prior = weights.shape_prior * len(chosen)
     reduced, pull = shape_prior * np.eye(n_betas), -shape_prior * at.betas[:n_betas]
@@ -159,7 +164,7 @@ def _round(
     eliminated = []
     for k, (body, normals, offset, same) in zip(chosen, frames, strict=True):
         area = vertex_areas(body.vertices, model.faces)
-        share = weights.n_independent * part_weight * same * area / area.sum()
+        share = weights.n_independent * cloth.part_weight * same * area / area.sum()
         residual, weight, data = _data_term(offset, thickness, share, weights)
         energy += data
         used = np.flatnonzero(weight > 0)[:: weights.every_vertex]

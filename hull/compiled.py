@@ -21,6 +21,8 @@ import numpy as np
 from numba import njit, types
 from numba.extending import intrinsic
 
+from hull.kernel import kernel
+
 _BELOW_HALF = float(np.nextafter(0.5, 0.0))
 _MOST_HALVINGS = 7
 _N_FALSE_POSITIONS = 3
@@ -45,14 +47,6 @@ _N_FALSE_POSITIONS = 3
 INSIDE, OUTSIDE, NO_EVIDENCE, UNDECIDED = 1, 2, 4, 7
 FIRST_OUTLINE_BLOCK = 8
 DEEP, HIGH = 1, 2
-
-
-def _kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    try:
-        return njit(cache=True, nogil=True, error_model="numpy")(function)
-    except RuntimeError:
-        # Nowhere to keep it: compiled once a process.
-        return njit(nogil=True, error_model="numpy")(function)
 
 
 def _inlined(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -206,7 +200,7 @@ def _ask_cell(numbers, p, k, x, y, z, half_m):
     )
 
 
-@_kernel
+@kernel
 @no_type_check
 def ask_cells(numbers, projections, centres, half_m, answers):
     """`answers` (C N): what every table answers about every cell."""
@@ -217,7 +211,7 @@ def ask_cells(numbers, projections, centres, half_m, answers):
             answers[k, i] = _ask_cell(numbers, projections, k, x, y, z, half_m)
 
 
-@_kernel
+@kernel
 @no_type_check
 def ask_children(
     numbers,
@@ -277,7 +271,7 @@ def ask_children(
     return n_asked, n_rejected, blind
 
 
-@_kernel
+@kernel
 @no_type_check
 def ask_voxels(
     numbers, projections, order, unasked_of, n_outside_of, cells, alive, low, voxel_m, votes, excepted
@@ -309,7 +303,7 @@ def ask_voxels(
                     break
 
 
-@_kernel
+@kernel
 @no_type_check
 def name_blocks(places, low, per_m, shape, name):
     """`name` (N,): of the block of a culling's grid that each place lies in."""
@@ -320,7 +314,7 @@ def name_blocks(places, low, per_m, shape, name):
         name[i] = (a * shape[1] + b) * shape[2] + c
 
 
-@_kernel
+@kernel
 @no_type_check
 def _way_out(numbers, k, base_u, base_v, base_depth, end_u, end_v, end_depth, outer):
     """`hull.surface.way_out` for one way."""
@@ -358,7 +352,7 @@ def _way_out(numbers, k, base_u, base_v, base_depth, end_u, end_v, end_depth, ou
     return outer * place * base_depth / (place * base_depth + (1.0 - place) * end_depth)
 
 
-@_kernel
+@kernel
 @no_type_check
 def exits(numbers, projections, origin, along, block, ends, who, exit_at, cut_by):
     """`hull.surface.exits` with one vote: `exit_at`, `cut_by` (N,). The tables that may
@@ -392,7 +386,7 @@ def exits(numbers, projections, origin, along, block, ends, who, exit_at, cut_by
         exit_at[i], cut_by[i] = share, last
 
 
-@_kernel
+@kernel
 @no_type_check
 def refuser(numbers, projections, x, y, z, first, second, from_, to, who, votes):
     """The table that is the `votes`-th to see a place outside, or -1. `first`, `second`: tables (or -1) that
@@ -411,7 +405,7 @@ def refuser(numbers, projections, x, y, z, first, second, from_, to, who, votes)
     return -1
 
 
-@_kernel
+@kernel
 @no_type_check
 def edge_kinds(
     numbers, projections, middle, way, up_m, down_m, far_m, first, second, block, ends, who, votes, high, kind
@@ -444,7 +438,7 @@ def edge_kinds(
                 kind[i] = HIGH
 
 
-@_kernel
+@kernel
 @no_type_check
 def witnesses(numbers, projections, places, block, answers, votes, sets, alive):
     """For `hull.thin_parts`: `alive` (N, all true) gets false where at least `votes` tables see a place
@@ -470,7 +464,7 @@ def witnesses(numbers, projections, places, block, answers, votes, sets, alive):
                     break
 
 
-@_kernel
+@kernel
 @no_type_check
 def outlines(
     numbers, projections, places, block, n_seen, ends, who, first, n_witnesses, n_bounding, point, table

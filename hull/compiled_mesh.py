@@ -7,22 +7,14 @@ Compiled and kept as in `hull.compiled`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import numpy as np
-from numba import njit
+
+from hull.kernel import kernel
 
 
-def _kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    try:
-        return njit(cache=True, nogil=True, error_model="numpy")(function)
-    except RuntimeError:
-        # Nowhere to keep it: compiled once a process.
-        return njit(nogil=True, error_model="numpy")(function)
-
-
-@_kernel
+@kernel
 @no_type_check
 def add_face_normals(vertices, faces, normals):
     """Each face's normal, twice its area long, added to its corners' `normals` (V 3)."""
@@ -45,7 +37,7 @@ def add_face_normals(vertices, faces, normals):
             normals[faces[f, k], 2] += z
 
 
-@_kernel
+@kernel
 @no_type_check
 def add_ring(last, faces, normals):
     """What the corners of each face have together, added to each of them."""
@@ -60,7 +52,7 @@ def add_ring(last, faces, normals):
             normals[faces[f, k], 2] += z
 
 
-@_kernel
+@kernel
 @no_type_check
 def make_unit(normals):
     for i in range(len(normals)):
@@ -69,7 +61,7 @@ def make_unit(normals):
         normals[i, 0], normals[i, 1], normals[i, 2] = x / length, y / length, z / length
 
 
-@_kernel
+@kernel
 @no_type_check
 def _root(parent, i):
     while parent[i] != i:
@@ -78,7 +70,7 @@ def _root(parent, i):
     return i
 
 
-@_kernel
+@kernel
 @no_type_check
 def face_pieces(faces, parent, number, label):
     """`hull.cleaning.face_pieces`: pieces are numbered in the order of their first vertices. `parent` (V,):
@@ -103,7 +95,7 @@ def face_pieces(faces, parent, number, label):
         label[f] = number[_root(parent, faces[f, 0])]
 
 
-@_kernel
+@kernel
 @no_type_check
 def spread_to_neighbours(values, faces, n_rounds):
     """The rounds of `hull.slack.spread_to_neighbours`. `values` is written into."""
@@ -137,7 +129,7 @@ def spread_to_neighbours(values, faces, n_rounds):
             return
 
 
-@_kernel
+@kernel
 @no_type_check
 def edge_middles(vertices, normals, faces, least_length, a_of, b_of, middle, way):
     """For `hull.ridges`: the rising edges (a, b) of a closed surface whose ends look the same way about, in
@@ -166,7 +158,7 @@ def edge_middles(vertices, normals, faces, least_length, a_of, b_of, middle, way
     return n
 
 
-@_kernel
+@kernel
 @no_type_check
 def number_vertices(padded, n_faces_of, first, within, cases):
     """For `hull.marching`: `first` (M,) vertex of each brick, the numbers `within` (M 3 8 8 8) it of those on
@@ -205,7 +197,7 @@ def number_vertices(padded, n_faces_of, first, within, cases):
     return n_vertices, n_faces
 
 
-@_kernel
+@kernel
 @no_type_check
 def brick_surface(
     padded, places, neighbours, n_faces_of, edges_of, first, within, cases, inner, outer, faces
@@ -247,7 +239,7 @@ def brick_surface(
                         f += 1
 
 
-@_kernel
+@kernel
 @no_type_check
 def piece_volumes(vertices, faces, label, middle, n_pieces):
     """`hull.cleaning.piece_volumes`: signed, about the `middle`."""
@@ -263,7 +255,7 @@ def piece_volumes(vertices, faces, label, middle, n_pieces):
     return volume
 
 
-@_kernel
+@kernel
 @no_type_check
 def picture_box(image):
     """(x, y, width, height) of the pixels that are not 0, as `cv2.boundingRect` has it; all 0 without any."""

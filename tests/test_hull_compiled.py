@@ -26,7 +26,6 @@ from hull.visual_hull import grid_over
 from hull.witnesses import witness_rule
 from tests.hull_subjects import figure
 
-pytestmark = pytest.mark.skipif(table_loops() is None, reason="numba is not installed")
 VOXEL_M = 0.02
 ROOT = Path(__file__).parent.parent
 
