@@ -10,10 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from fit.align import Alignment
 from fit.initialise import PoseFinder
+from fit.outliers import lost_points
 from fit.settings import FitSettings
 from fit.solver import Fitter, Objective, ScanPoints, Unknowns, minimise
 from fit.state import BodyState
@@ -21,9 +22,8 @@ from fit.surface import vertex_normals
 from fit.thickness import Thickness, smoothed_over_mesh
 from fit.together import ENOUGH_FRAMES, Together, can_be_together, fit_together
 
-#: Unposed vertices this many robust deviations inside the others are lost points, not a tighter fit.
-CLIP_MAD = 3.5
-CLIP_FLOOR_M = 0.004
+#: More points of unposed alignments than this add time and nothing else.
+MOST_POINTS = 250_000
 
 
 @dataclass(frozen=True)
@@ -44,19 +44,6 @@ class FusionShape:
     trust: float = 1.0
     thickness: Thickness | None = None
     confidence: Float[np.ndarray, "v"] | None = None
-
-
-def lost_points(
-    offsets: Float[np.ndarray, "t v"], clip_mad: float = CLIP_MAD, floor_m: float = CLIP_FLOOR_M
-) -> Bool[np.ndarray, "t v"]:
-    """Which unposed vertices lie implausibly far inside their fellows of the other frames.
-
-    offsets: along the common normal, positive outwards, m. Only inward outliers are dropped: they alone pull
-    the shape in, and the outside term has little resistance against them.
-    """
-    median = np.median(offsets, axis=0)
-    spread = 1.4826 * np.median(np.abs(offsets - median), axis=0)
-    return offsets < median - np.maximum(clip_mad * spread, floor_m)
 
 
 def trust_in_spread(alignments: Sequence[Alignment], settings: FitSettings) -> float:
@@ -111,29 +98,14 @@ def fused(
     good = usable(alignments)
     if not settings.at_once or not can_be_together(good, trust_in_spread(good, settings)):
         return fuse(fitter, alignments, settings, skin_shares), list(alignments)
-    together = fit_together(fitter, finder, good, settings)
-    if skin_shares is not None:
-        together = replace(
-            together,
-            thickness=undressed(
-                together.thickness, np.mean([skin_shares[a.frame_id] for a in good], axis=0), settings
-            ),
-        )
+    bare = None if skin_shares is None else np.mean([skin_shares[a.frame_id] for a in good], axis=0)
+    together = fit_together(fitter, finder, good, settings, bare)
     again = together.realigned(fitter, good)
     by_frame = {a.frame_id: a for a in again}
     # A suspect frame does not speak for the shape, but it is tracked like the others.
     return (
         fuse_together(fitter, again, together, settings),
         [by_frame.get(a.frame_id, a) for a in alignments],
-    )
-
-
-def undressed(thickness: Thickness, bare: Float[np.ndarray, "v"], settings: FitSettings) -> Thickness:
-    """The clothes' thickness where a share (V) of the surface is known to be bare: there is none on it."""
-    return replace(
-        thickness,
-        expected=(1.0 - bare) * thickness.expected,
-        tolerance=(1.0 - bare) * thickness.tolerance + bare * settings.thickness.tolerance_m,
     )
 
 
@@ -149,17 +121,22 @@ def fuse_together(
     model = fitter.model
     template, joints = fitter.shaped(together.betas), fitter.joints(together.betas)
     clothed = np.stack([a.state.template for a in alignments])
-    n, normals = len(clothed), vertex_normals(template, model.faces)
+    normals = vertex_normals(template, model.faces)
     expected = clothed.mean(0) - together.thickness.expected[:, None] * normals
     certainty = (settings.thickness.tolerance_m / together.thickness.tolerance) ** 2
     offsets = np.einsum("tva,va->tv", clothed - clothed.mean(0), normals)
-    keep = ~lost_points(offsets)
+    speak = ~lost_points(offsets)
+    if offsets.size > MOST_POINTS:  # the union of hundreds of frames: a part of each says the same
+        speak &= np.random.default_rng(0).random(offsets.shape) * offsets.size < MOST_POINTS
+    frame_normals = np.stack([vertex_normals(t, model.faces) for t in clothed])
+    n_cloth, n_vertices = int(speak.sum()), model.n_vertices
     # Both terms are means over their points times the number of vertices, whatever the number of frames.
+    n_points = n_cloth + n_vertices
     scan = ScanPoints(
-        np.concatenate([clothed.reshape(-1, 3), expected]),
-        np.concatenate([*(vertex_normals(t, model.faces) for t in clothed), normals]),
-        np.concatenate([keep.ravel() * (n + 1) / n, certainty * (n + 1)]),
-        np.repeat([False, True], [offsets.size, model.n_vertices]),
+        np.concatenate([clothed[speak], expected]),
+        np.concatenate([frame_normals[speak], normals]),
+        np.concatenate([np.full(n_cloth, n_points / n_cloth), certainty * n_points / n_vertices]),
+        np.repeat([False, True], [n_cloth, n_vertices]),
     )
     state = BodyState(template, np.zeros((model.n_joints, 3)), np.zeros(3), together.betas)
     pose_size = 3 * (model.n_joints - 1)

@@ -89,7 +89,9 @@ class TogetherSettings:
     n_independent: independent observations that a frame's surface is worth; outlier: residuals of so many
     tolerances count half; outside_m: how far cloth may be inside the body; shape_prior: of the betas, times
     the number of frames; pose_prior: a frame; every_vertex: only every n-th vertex is summed; shape_frames:
-    at most so many frames find the betas; rounds, rest: at most so many, until nothing moves farther.
+    at most so many frames find the betas, the first of them so that the others start near; rounds, rest: at
+    most so many, until nothing moves farther, or relative_drop: until the energy changes by no more than this
+    share; near: what single poses are brought to (rad).
     """
 
     n_independent: float = 300.0
@@ -98,9 +100,12 @@ class TogetherSettings:
     shape_prior: float = 1.0
     pose_prior: float = 1.0
     every_vertex: int = 2
+    first_frames: int = 12
     shape_frames: int = 40
     rounds: int = 10
     rest: float = 0.02
+    relative_drop: float = 5e-3
+    near: float = 0.05
 
 
 @dataclass(frozen=True)

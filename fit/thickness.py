@@ -9,7 +9,7 @@ the expected thickness; so it is nought where skin is bare and several centimetr
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,6 +17,7 @@ from scipy.sparse import coo_matrix
 
 from fit.body.model import BodyModel
 from fit.body.skeleton import JOINT_NAMES, axis_angle_to_matrix
+from fit.outliers import robust_variance
 from fit.settings import ThicknessSettings
 
 #: Thickness over movement (both along the normal) of the cloth that lies over a bone, by SMPL joint. Cloth is
@@ -91,7 +92,7 @@ def expected_thickness(
     pooled over the neighbourhood before they are compared.
     """
     # One frame with an arm against the trunk must not pass for a coat.
-    variance = np.minimum(offsets.var(axis=0), settings.largest_movement_m**2)
+    variance = np.minimum(robust_variance(offsets), settings.largest_movement_m**2)
     variance = smoothed_over_mesh(variance, faces, settings.pooling_rounds)
     own = settings.noise_m**2 + smoothed_over_mesh(noise**2, faces, settings.pooling_rounds)
     movement = np.sqrt(np.maximum(variance - own, 0.0))
@@ -100,3 +101,12 @@ def expected_thickness(
     expected = settings.thinnest_m + settings.per_movement * ratio * damped
     tolerance = np.sqrt(settings.tolerance_m**2 + own + (settings.tolerance_share * expected) ** 2)
     return Thickness(expected, tolerance, movement)
+
+
+def undressed(thickness: Thickness, bare: Float[np.ndarray, "v"], settings: ThicknessSettings) -> Thickness:
+    """The clothes' thickness where a share (V) of the surface is known to be bare: there is none on it."""
+    return replace(
+        thickness,
+        expected=(1.0 - bare) * thickness.expected,
+        tolerance=(1.0 - bare) * thickness.tolerance + bare * settings.tolerance_m,
+    )

@@ -20,11 +20,12 @@ from fit.align import Alignment
 from fit.articulation import PosedBody
 from fit.body.parts import region_of_vertices
 from fit.initialise import PoseFinder
+from fit.outliers import lost_points
 from fit.settings import FitSettings, TogetherSettings
 from fit.solver import Fitter
 from fit.state import BodyState
 from fit.surface import vertex_areas, vertex_normals
-from fit.thickness import Thickness, bending_noise, expected_thickness, thickness_per_movement
+from fit.thickness import Thickness, bending_noise, expected_thickness, thickness_per_movement, undressed
 
 #: Parts that shoes, hair and coarse hulls make unreliable count this much.
 VAGUE_PARTS, VAGUE_WEIGHT = ("hand", "foot", "head"), 0.3
@@ -69,13 +70,14 @@ class _Frames:
 
 @dataclass(frozen=True)
 class _Cloth:
-    """The posed alignments: vertices and normals (T V 3); part_weight, ratio (V): how much a vertex's part
-    counts, and `thickness_per_movement`."""
+    """The posed alignments: vertices and normals (T V 3); part_weight, ratio, bare (V): how much a vertex's
+    part counts, `thickness_per_movement`, and how surely it is known to be bare skin."""
 
     vertices: Float[np.ndarray, "t v 3"]
     normals: Float[np.ndarray, "t v 3"]
     part_weight: Float[np.ndarray, "v"]
     ratio: Float[np.ndarray, "v"]
+    bare: Float[np.ndarray, "v"]
 
 
 def can_be_together(alignments: Sequence[Alignment], trust: float) -> bool:
@@ -84,7 +86,11 @@ def can_be_together(alignments: Sequence[Alignment], trust: float) -> bool:
 
 
 def fit_together(
-    fitter: Fitter, finder: PoseFinder, alignments: Sequence[Alignment], settings: FitSettings
+    fitter: Fitter,
+    finder: PoseFinder,
+    alignments: Sequence[Alignment],
+    settings: FitSettings,
+    bare: Float[np.ndarray, "v"] | None = None,
 ) -> Together:
     """Minimise over betas and all poses
 
@@ -93,6 +99,7 @@ def fit_together(
     a: the vertex's share of the area, w: less for hands, feet and head, n: independent observations a frame.
     The thickness is estimated anew every round from the same residuals. Shapes have to explain all frames, so
     at most `shape_frames` of them (evenly spread) take part in finding the betas; the others' poses follow.
+    bare (V): share of the frames in which a vertex was seen to be bare skin: it holds pose and shape there.
     """
     from threadpoolctl import threadpool_limits
 
@@ -103,6 +110,7 @@ def fit_together(
         np.stack([vertex_normals(v, fitter.model.faces) for v in posed]),
         np.where(np.isin(region_of_vertices(fitter.model), VAGUE_PARTS), VAGUE_WEIGHT, 1.0),
         thickness_per_movement(fitter.model),
+        np.zeros(fitter.model.n_vertices) if bare is None else bare,
     )
     at = _Frames(
         np.stack([a.state.pose for a in alignments]),
@@ -110,24 +118,54 @@ def fit_together(
         np.median([a.state.betas for a in alignments], axis=0),
     )
     n = len(alignments)
-    chosen = np.unique(np.linspace(0, n - 1, min(n, weights.shape_frames)).round().astype(int))
-    rest = np.setdiff1d(np.arange(n), chosen)
+    few, chosen = (_evenly(n, k) for k in (weights.first_frames, weights.shape_frames))
     energies: list[float] = []
     thickness = None
     # The matrices are small: threads would only fight over them.
     with threadpool_limits(limits=1, user_api="blas"):
+        # A few frames bring the betas near; the others' poses then have little left to go.
+        if len(few) < len(chosen):
+            for _ in range(weights.rounds):
+                thickness, _, moved = _round(fitter, finder, cloth, at, few, settings, None)
+                if moved < weights.near:
+                    break
+            for k in np.setdiff1d(chosen, few):
+                _settle(fitter, finder, cloth, at, k, settings, thickness)
         for _ in range(weights.rounds):
             thickness, energy, moved = _round(fitter, finder, cloth, at, chosen, settings, None)
             energies.append(energy)
-            if moved < weights.rest:
+            if moved < weights.rest or _at_rest(energies, weights.relative_drop):
                 break
         assert thickness is not None, "at least one round"
-        for k in rest:
-            for _ in range(weights.rounds):
-                _, _, moved = _round(fitter, finder, cloth, at, np.array([k]), settings, thickness)
-                if moved < weights.rest:
-                    break
+        for k in np.setdiff1d(np.arange(n), chosen):
+            _settle(fitter, finder, cloth, at, k, settings, thickness)
     return Together(at.poses, at.translations, at.betas, thickness, tuple(energies))
+
+
+def _evenly(n: int, most: int) -> Int[np.ndarray, "k"]:
+    """At most so many of n frames, evenly spread."""
+    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int))
+
+
+def _at_rest(energies: Sequence[float], relative_drop: float) -> bool:
+    """Whether the last round gained next to nothing; a round that moved the thickness may lose."""
+    return len(energies) > 1 and abs(energies[-2] - energies[-1]) < relative_drop * energies[-1]
+
+
+def _settle(
+    fitter: Fitter,
+    finder: PoseFinder,
+    cloth: _Cloth,
+    at: _Frames,
+    k: int,
+    settings: FitSettings,
+    thickness: Thickness | None,
+) -> None:
+    """The pose of frame k alone, under clothes whose thickness is known."""
+    for _ in range(settings.together.rounds):
+        _, _, moved = _round(fitter, finder, cloth, at, np.array([k]), settings, thickness)
+        if moved < settings.together.near:
+            return
 
 
 def _round(
@@ -153,22 +191,27 @@ def _round(
         same = np.einsum("va,va->v", cloth.normals[k], normals) > SAME_SIDE
         frames.append((body, normals, offset, same))
     thickness = held
+    lost = np.zeros((len(chosen), model.n_vertices), dtype=bool)
     if thickness is None:
         noise = bending_noise(model, at.poses[chosen], vertex_normals(template, model.faces))
         offsets = np.stack([f[2] for f in frames])
+        lost = lost_points(offsets)
         thickness = expected_thickness(offsets, noise, cloth.ratio, model.faces, settings.thickness)
+        thickness = undressed(thickness, cloth.bare, settings.thickness)
     n_betas = 0 if held is not None else model.n_betas
     shape_prior = weights.shape_prior * len(chosen)
     reduced, pull = shape_prior * np.eye(n_betas), -shape_prior * at.betas[:n_betas]
     energy = shape_prior * float(at.betas @ at.betas)
     eliminated = []
-    for k, (body, normals, offset, same) in zip(chosen, frames, strict=True):
+    # What many frames say together needs fewer vertices of each.
+    stride = weights.every_vertex * max(1, round(len(chosen) / weights.first_frames / 2))
+    for k, (body, normals, offset, same), gone in zip(chosen, frames, lost, strict=True):
         area = vertex_areas(body.vertices, model.faces)
-        share = weights.n_independent * cloth.part_weight * same * area / area.sum()
+        share = weights.n_independent * cloth.part_weight * (same & ~gone) * area / area.sum()
         residual, weight, data = _data_term(offset, thickness, share, weights)
         energy += data
-        used = np.flatnonzero(weight > 0)[:: weights.every_vertex]
-        weight = weights.every_vertex * weight[used]
+        used = np.flatnonzero(weight > 0)[::stride]
+        weight = stride * weight[used]
         own, rhs = _by_pose(body, normals, used, weight, residual[used])
         cross, corner, rhs_betas = _by_betas(
             fitter, at.poses[k], body, normals, used, weight, residual[used], n_betas
