@@ -58,7 +58,8 @@ def plan(quick: bool, full: bool, n_frames: int) -> dict[str, list[Cell]]:
     inputs = [SCANS, LABELLED, HULLS_16, *([HULLS_68] if full else [])]
     table = [Cell(s, o, m, i, n_frames) for s in seeds for o in outfits for m in motions for i in inputs]
     loose = seeds[:1] if quick else seeds[:4]
-    looseness = [Cell(s, o, MOTIONS[0], SCANS, n_frames) for s in loose for o in LOOSENESS]
+    grades = (LOOSENESS[0], LOOSENESS[2], LOOSENESS[3]) if quick else LOOSENESS
+    looseness = [Cell(s, o, MOTIONS[0], SCANS, n_frames) for s in loose for o in grades]
     if not quick:
         looseness += [Cell(s, o, MOTIONS[0], HULLS_16, n_frames) for s in loose[:2] for o in LOOSENESS]
     frames = [
@@ -155,8 +156,9 @@ def report(out: Path, studies: dict[str, list[Cell]], any_version: bool) -> str:
         text.append(tables.looseness_table(found["looseness"]))
         drawn.append(("looseness.png", plots.looseness_figure, found["looseness"]))
     if found.get("frames"):
-        text.append(tables.frames_table(found["frames"]))
-        drawn.append(("frames.png", plots.frames_figure, [_with_used(c) for c in found["frames"]]))
+        by_number = [_with_used(c) for c in found["frames"]]
+        text.append(tables.frames_table(by_number))
+        drawn.append(("frames.png", plots.frames_figure, by_number))
     for name, draw, which in drawn:
         draw(out / name, which)
     _write(out / "cells.csv", tables.cells_csv(cells))
@@ -170,6 +172,7 @@ def report(out: Path, studies: dict[str, list[Cell]], any_version: bool) -> str:
 
 
 def _with_used(cell: Found) -> Found:
+    """A cell whose number of fitted frames is told where all were taken, too."""
     return cell | {"cell": cell["cell"] | {"used": cell["cell"]["used"] or cell["cell"]["n_frames"]}}
 
 

@@ -86,9 +86,9 @@ class Cell:
 
 @dataclass(frozen=True)
 class Fitted:
-    """All that a fit gives: scans as they were fitted, alignments as fused, fusion shape, track, seconds."""
+    """All that a fit gives: cloth alignments as first found, and as fused; fusion shape, track, seconds."""
 
-    scans: dict[int, Scan]
+    first: list[Alignment]
     alignments: list[Alignment]
     fusion: FusionShape
     track: list[TrackedFrame]
@@ -107,11 +107,11 @@ def _fit(
     """What `bodyhull fit` does with scans or hulls, in its order."""
     started = time.perf_counter()
     fitter, finder = _tools()
-    alignments = align_sequence(fitter, finder, [(k, s, None) for k, s in scans.items()], settings)
-    scans, shares = labelled(fitter, scans, alignments, settings)
-    fusion, alignments = fused(fitter, finder, alignments, settings, shares)
+    first = align_sequence(fitter, finder, [(k, s, None) for k, s in scans.items()], settings)
+    scans, shares = labelled(fitter, scans, first, settings)
+    fusion, alignments = fused(fitter, finder, first, settings, shares)
     track = track_sequence(fitter, finder, fusion, alignments, scans, settings, container_of=container_of)
-    return Fitted(scans, alignments, fusion, track, time.perf_counter() - started)
+    return Fitted(first, alignments, fusion, track, time.perf_counter() - started)
 
 
 @lru_cache(maxsize=1)
@@ -142,7 +142,7 @@ def measure(cell: Cell) -> dict[str, Any]:
     parametric = None
     if cell.source != LABELLED:  # it knows no skin
         fitter, finder = _tools()
-        parametric = fit_parameters(fitter, finder, scans, fitted.alignments, settings)
+        parametric = fit_parameters(fitter, finder, scans, fitted.first, settings)
     found = _scored(recorded, fitted, parametric)
     return {
         "cell": asdict(cell),

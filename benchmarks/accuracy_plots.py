@@ -49,9 +49,9 @@ def _drawn(
         axis.set_axisbelow(True)
     handles, names = axes[0].get_legend_handles_labels()
     if names:
-        figure.legend(
-            handles, names, loc="outside lower center", ncols=min(len(names), 4), frameon=False, fontsize=8.5
-        )
+        # A name takes up to 2.8 inches.
+        n = max(1, int(width / 2.8))
+        figure.legend(handles, names, loc="outside lower center", ncols=n, frameon=False, fontsize=8.5)
     write_atomically(path, lambda temporary: canvas.print_png(temporary))
 
 
@@ -152,7 +152,7 @@ def table_figure(path: Path, cells: Sequence[Found]) -> None:
             _title(axis, motion)
         axes[0].set_ylabel("RMS, mm, paper's measure", fontsize=9)
 
-    _drawn(path, draw, len(motions), max(1.4 + 1.15 * len(sources), 3.4) * len(motions), 4.2)
+    _drawn(path, draw, len(motions), max(1.4 + 1.15 * len(sources), 3.4) * len(motions), 4.4)
 
 
 def _short(source: str) -> str:
