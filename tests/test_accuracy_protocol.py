@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.accuracy import chosen, plan
+from benchmarks.accuracy_baseline import in_zero_pose
 from benchmarks.accuracy_cells import DETAILED, FUSION, Cell
 from benchmarks.accuracy_protocol import (
     Posed,
@@ -21,7 +22,10 @@ from benchmarks.accuracy_protocol import (
 )
 from benchmarks.accuracy_subjects import SEEDS, scanned
 from benchmarks.accuracy_tables import laws, markdown, summary, table_one
+from fit.body.model import load_body
 from fit.evaluate import Surface
+from fit.solver import Fitter, ScanPoints
+from fit.state import BodyState
 from fit.surface import vertex_normals
 from render.scene import Surface as Drawn
 
@@ -127,6 +131,25 @@ def test_a_scan_shows_the_outside_and_labels_what_it_shows() -> None:
     assert scan.is_skin[scan.points[:, 2] < 0.95].all()
     assert abs(radius[above].mean() - 0.21) < 0.001
     assert radius[above].min() > 0.206
+
+
+def test_points_of_a_posed_body_go_back_to_the_zero_pose() -> None:
+    model = load_body("free:neutral", show_progress=False)
+    fitter, rng = Fitter.of(model), np.random.default_rng(2)
+    betas = np.zeros(model.n_betas)
+    betas[:4] = rng.standard_normal(4)
+    pose = 0.2 * rng.standard_normal((model.n_joints, 3))
+    state = BodyState(fitter.shaped(betas), pose, np.array([0.1, 1.0, -0.3]), betas)
+    posed = fitter.posed(state)
+    points = posed + 0.002 * vertex_normals(posed, model.faces)
+    n = len(points)
+    back = in_zero_pose(
+        fitter, state, ScanPoints(points, vertex_normals(posed, model.faces), np.ones(n), np.zeros(n, bool))
+    )
+    away = np.linalg.norm(back.points - state.template, axis=1)
+    assert np.median(away) == pytest.approx(0.002, rel=0.1)
+    along = np.einsum("va,va->v", back.normals, vertex_normals(state.template, model.faces))
+    assert np.median(along) > 0.99
 
 
 def cell_of(seed: int, source: str, fusion: float, detailed: float) -> dict:
