@@ -151,9 +151,9 @@ def report(out: Path, studies: dict[str, list[Cell]], any_version: bool) -> str:
         text += [tables.confidence_table(table), tables.pose_table(table)]
         beyond = [beyond_parameters_mm(seed) for seed in sorted({c["cell"]["seed"] for c in table})]
         text.append(
-            f"\nBeyond any parameters of the fitted body: {', '.join(f'{x:.2f}' for x in beyond)} mm RMS along"
-            " the normal, person by person. The paper's people were real, and its 17 to 20 mm for parameters "
-            "only come from another body model."
+            f"\nBeyond any parameters of the fitted body: {', '.join(f'{x:.2f}' for x in beyond)} mm RMS"
+            " along the normal, person by person. The paper's people were real, and its 17 to 20 mm for "
+            "parameters only come from another body model."
         )
         drawn += [
             ("table.png", plots.table_figure, table),
