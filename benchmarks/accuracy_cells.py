@@ -22,7 +22,6 @@ from benchmarks.accuracy_baseline import Parametric, fit_parameters
 from benchmarks.accuracy_protocol import (
     Posed,
     Score,
-    confidence_at,
     error_by_frame,
     low_quantile_shape,
     marker_errors_mm,
@@ -31,6 +30,7 @@ from benchmarks.accuracy_protocol import (
     rms_by_confidence,
     score,
     share_within,
+    value_at,
 )
 from benchmarks.accuracy_subjects import LABELLED, RIGS, SCANS, Recorded, rig_of
 from bodyhull.folder import write_atomically
@@ -54,6 +54,8 @@ BODY = "free:neutral"
 SCORED_FRAMES = 12
 #: In so many of them errors are compared with the confidence.
 CONFIDENCE_FRAMES = 5
+#: The modules of `render` that decide how a person looks and moves.
+MAKE_PEOPLE = ("subject", "garments", "wardrobe", "motions", "limb_angles", "synthetic")
 BASELINE, MEAN, QUANTILE, FUSION, DETAILED = "parameters", "mean", "quantile", "fusion", "detailed"
 RESULTS = (BASELINE, MEAN, QUANTILE, FUSION, DETAILED)
 
@@ -166,6 +168,8 @@ def _scored(recorded: Recorded, fitted: Fitted, parametric: Parametric | None) -
     bodies = _Bodies(fitted, parametric)
     scores: dict[str, list[Score]] = {name: [] for name in bodies.names}
     sure: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    expected: list[float] = []
+    thickness = fitted.fusion.thickness
     for frame in good:
         if frame.frame_id not in chosen:
             continue
@@ -177,11 +181,14 @@ def _scored(recorded: Recorded, fitted: Fitted, parametric: Parametric | None) -
                 reposed = scores[name][-1].reposed
                 sure.append(
                     (
-                        confidence_at(fitted.fusion.confidence, result.surface, reposed[scored]),
+                        value_at(fitted.fusion.confidence, result.surface, reposed[scored]),
                         signed_error_mm(reposed[scored], result.surface),
                         vertex_areas(reposed, faces)[scored],
                     )
                 )
+                if thickness is not None and recorded.under_cloth.any():
+                    under = reposed[scored & recorded.under_cloth]
+                    expected.append(1e3 * float(value_at(thickness.expected, result.surface, under).mean()))
     markers = markers_of(recorded.subject.template, recorded.subject.joints)
     true_markers = np.stack([recorded.truth(f.frame_id)[list(markers.values())] for f in good])
     pose = {}
@@ -196,7 +203,6 @@ def _scored(recorded: Recorded, fitted: Fitted, parametric: Parametric | None) -
             "share_within": share_within(errors).round(5).tolist(),
             "by_marker": dict(zip(markers, errors.mean((0, 1)).round(2).tolist(), strict=True)),
         }
-    thickness = fitted.fusion.thickness
     return {
         "frames": {
             "fitted": len(fitted.track),
@@ -204,7 +210,7 @@ def _scored(recorded: Recorded, fitted: Fitted, parametric: Parametric | None) -
             "suspect": sum(f.status == "suspect" for f in good),
             "scored": len(chosen),
         },
-        "thickness_known": thickness is not None,
+        "expected_cloth_mm": float(np.mean(expected)) if expected else None,
         "trust": fitted.fusion.trust,
         "errors": {
             name: {
@@ -257,18 +263,22 @@ class _Bodies:
 
 
 def _of_scans(recorded: Recorded, scans: dict[int, Scan]) -> dict[str, float]:
-    """How far the scans themselves lie from the naked body, mm: mean over their points at what is scored."""
+    """How far the scans themselves lie from the naked body, mm: mean over their points at what is scored, and
+    at what is under cloth of that."""
     from fit.closest import closest_points
 
     faces, scored = recorded.subject.body.faces, recorded.scored
     frames = list(scans)[:: max(1, len(scans) // CONFIDENCE_FRAMES)]
-    off = []
+    off, cloth = [], []
     for k in frames:
         closest = closest_points(recorded.truth(k), faces, scans[k].points)
-        off.append(closest.distance[scored[faces[closest.triangle_idx]].all(1)])
-    away = 1e3 * np.concatenate(off)
+        corners = faces[closest.triangle_idx]
+        off.append(closest.distance[scored[corners].all(1)])
+        cloth.append(closest.distance[(scored & recorded.under_cloth)[corners].all(1)])
+    under = np.concatenate(cloth)
     return {
-        "mean_mm": float(away.mean()),
+        "mean_mm": 1e3 * float(np.concatenate(off).mean()),
+        "cloth_mm": 1e3 * float(under.mean()) if len(under) else 0.0,
         "skin_share": float(np.mean([s.is_skin.mean() for s in scans.values()])),
     }
 
@@ -281,7 +291,8 @@ def version() -> str:
     found = sha256()
     found.update(load_body(BODY, show_progress=False).content_hash.encode())
     found.update(repr(FitSettings()).encode())
-    files = [f for room in ("fit", "hull", "render") for f in sorted((root / room).rglob("*.py"))]
+    files = [f for room in ("fit", "hull") for f in sorted((root / room).rglob("*.py"))]
+    files += [root / "render" / f"{name}.py" for name in MAKE_PEOPLE]
     files += [Path(m.__file__) for m in (accuracy_baseline, accuracy_protocol, accuracy_subjects)]
     for file in [*files, Path(__file__)]:
         found.update(file.read_bytes())

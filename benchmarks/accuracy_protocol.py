@@ -156,12 +156,12 @@ def share_within(
     return np.searchsorted(np.sort(errors.ravel()), distances_mm, side="right") / errors.size
 
 
-def confidence_at(
-    confidence: Float[np.ndarray, "w"], result: Surface, points: Float[np.ndarray, "n 3"]
+def value_at(
+    value: Float[np.ndarray, "w"], result: Surface, points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n"]:
     """A value a vertex of the result (W), at the places of its surface nearest to points (N 3)."""
     closest = closest_points(result.vertices, result.faces, points)
-    return (closest.barycentric * confidence[result.faces[closest.triangle_idx]]).sum(1)
+    return (closest.barycentric * value[result.faces[closest.triangle_idx]]).sum(1)
 
 
 def rms_by_confidence(

@@ -122,6 +122,7 @@ def summary(cells: Sequence[Found]) -> str:
                 with_bias(here, DETAILED, "under_cloth"),
                 with_bias(here, DETAILED, "direct"),
                 f"{np.mean([c['scan']['mean_mm'] for c in here]):.1f}",
+                _cloth(here),
                 f"{BARS[source]:g}" if source in BARS else "",
             ]
         )
@@ -131,6 +132,7 @@ def summary(cells: Sequence[Found]) -> str:
         "detailed, under cloth",
         "detailed, direct",
         "input itself, mean mm outside",
+        "cloth: true, expected mm",
         "bar",
     ]
     title = (
@@ -204,12 +206,29 @@ def looseness_table(cells: Sequence[Found]) -> str:
                     f"{outfit} ({len(here)})",
                     SOURCES[source],
                     f"{np.mean([c['scan']['mean_mm'] for c in here]):.1f}",
+                    _cloth(here),
                     *(with_bias(here, r) for r in RESULTS),
                     _within(np.array([bias(c, DETAILED) for c in here]), outfit),
                 ]
             )
-    header = ["clothes (cells)", "source", "input outside, mm", *(NAMES[r] for r in RESULTS), "within 2 mm"]
+    header = [
+        "clothes (cells)",
+        "source",
+        "input outside, mm",
+        "cloth: true, expected mm",
+        *(NAMES[r] for r in RESULTS),
+        "within 2 mm",
+    ]
     return markdown("By looseness of the clothes: RMS (bias), mm", header, rows)
+
+
+def _cloth(cells: Sequence[Found]) -> str:
+    """How far cloth (of hulls: with their own excess) stands away, and how far the fusion expects it to."""
+    told = [c for c in cells if c.get("expected_cloth_mm") is not None]
+    if not told:
+        return "-"
+    true = np.mean([c["scan"]["cloth_mm"] for c in told])
+    return f"{true:.1f}, {np.mean([c['expected_cloth_mm'] for c in told]):.1f}"
 
 
 def _within(off: np.ndarray, outfit: str) -> str:
