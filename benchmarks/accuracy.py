@@ -22,6 +22,8 @@ import argparse
 import multiprocessing
 import os
 import sys
+import threading
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -112,7 +114,9 @@ def finish(out: Path, cells: Sequence[Cell], n_jobs: int) -> list[str]:
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     with (
         tqdm(total=sum(map(len, order)), desc="cells", unit="cell", disable=False) as bar,
-        ProcessPoolExecutor(n_jobs, mp_context=multiprocessing.get_context("spawn")) as pool,
+        ProcessPoolExecutor(
+            n_jobs, multiprocessing.get_context("spawn"), _end_with_parent, (os.getpid(),)
+        ) as pool,
     ):
         pending = {pool.submit(finish_cells, out, job): job for job in order}
         try:
@@ -123,6 +127,17 @@ def finish(out: Path, cells: Sequence[Cell], n_jobs: int) -> list[str]:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     return lost
+
+
+def _end_with_parent(parent: int) -> None:
+    """A process of the pool ends soon after a parent that was killed, instead of waiting for it for ever."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(2.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def report(out: Path, studies: dict[str, list[Cell]], any_version: bool) -> str:
