@@ -57,6 +57,7 @@ CONFIDENCE_FRAMES = 5
 #: The modules of `render` that decide how a person looks and moves.
 MAKE_PEOPLE = ("subject", "garments", "wardrobe", "motions", "limb_angles", "synthetic")
 BASELINE, MEAN, QUANTILE, FUSION, DETAILED = "parameters", "mean", "quantile", "fusion", "detailed"
+MEASURES = ("paper", "under_cloth", "bare", "direct")
 RESULTS = (BASELINE, MEAN, QUANTILE, FUSION, DETAILED)
 
 
@@ -176,7 +177,7 @@ def _scored(recorded: Recorded, fitted: Fitted, parametric: Parametric | None) -
         truth = recorded.truth(frame.frame_id)
         for name in bodies.names:
             result = bodies.posed(name, frame)
-            scores[name].append(score(result, truth, faces, scored, recorded.under_cloth))
+            scores[name].append(score(result, truth, faces, scored, recorded.under_cloth, recorded.bare))
             if name == FUSION and frame.frame_id in surely and fitted.fusion.confidence is not None:
                 reposed = scores[name][-1].reposed
                 sure.append(
@@ -214,8 +215,7 @@ def _scored(recorded: Recorded, fitted: Fitted, parametric: Parametric | None) -
         "trust": fitted.fusion.trust,
         "errors": {
             name: {
-                measure: asdict(average([getattr(s, measure) for s in scores[name]]))
-                for measure in ("paper", "under_cloth", "direct")
+                measure: asdict(average([getattr(s, measure) for s in scores[name]])) for measure in MEASURES
             }
             for name in bodies.names
         },

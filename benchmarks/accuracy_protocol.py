@@ -56,11 +56,12 @@ class Posed:
 
 @dataclass(frozen=True)
 class Score:
-    """One result in one frame: errors (mm) by the paper's measure, of all that counts and of its part under
-    cloth; errors as it stands; the re-posed truth (V 3)."""
+    """One result in one frame: errors (mm) by the paper's measure, and of that what lies under cloth and what
+    is bare; errors as it stands; the re-posed truth (V 3)."""
 
     paper: ErrorSummary
     under_cloth: ErrorSummary
+    bare: ErrorSummary
     direct: ErrorSummary
     reposed: Float[np.ndarray, "v 3"]
 
@@ -71,17 +72,19 @@ def score(
     faces: Int[np.ndarray, "f 3"],
     scored: Bool[np.ndarray, "v"],
     under_cloth: Bool[np.ndarray, "v"],
+    bare: Bool[np.ndarray, "v"],
 ) -> Score:
-    """Score a result against the true naked body (V 3, m) of the same frame."""
+    """Score a result against the true naked body (V 3, m) of the same frame; masks over the true vertices."""
     area = vertex_areas(truth, faces)
     direct = signed_error_mm(truth[scored], result.surface)
     rig = transfer_rig(truth, result.surface, result.weights, result.joints, result.parents)
     reposed = pose_truth_to(truth, faces, scored, rig, result.surface)
     shape = signed_error_mm(reposed[scored], result.surface)
-    again, covered = vertex_areas(reposed, faces)[scored], under_cloth[scored]
+    again = vertex_areas(reposed, faces)[scored]
+    parts = [summarise(shape[mask[scored]], again[mask[scored]]) for mask in (under_cloth, bare)]
     return Score(
         summarise(shape, again),
-        summarise(shape[covered], again[covered]),
+        *parts,
         summarise(direct, area[scored]),
         reposed,
     )

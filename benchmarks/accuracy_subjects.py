@@ -26,7 +26,7 @@ from hull.rays import RayScene
 from hull.scan import Scan, even_samples
 from hull.visual_hull import build_hull
 from render.scene import Surface
-from render.subject import CLOTH, Subject, make_subject
+from render.subject import BARE, CLOTH, Subject, make_subject
 from render.synthetic import RECORDING_FROM_BODY, Performance, perform
 
 #: Nothing was tuned on these; odd ones are women.
@@ -101,6 +101,11 @@ class Recorded:
     def under_cloth(self) -> Bool[np.ndarray, "v"]:
         """Which true vertices cloth covers."""
         return self.subject.covered == CLOTH
+
+    @property
+    def bare(self) -> Bool[np.ndarray, "v"]:
+        """Which true vertices nothing covers."""
+        return self.subject.covered == BARE
 
     def truth(self, frame_idx: int) -> Float[np.ndarray, "v 3"]:
         """The naked body of a frame."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.accuracy_cells import BASELINE, DETAILED, FUSION, MEAN, QUANTILE, RESULTS
+from benchmarks.accuracy_cells import BASELINE, DETAILED, FUSION, MEAN, MEASURES, QUANTILE, RESULTS
 from benchmarks.accuracy_protocol import DISTANCES_MM
 from benchmarks.accuracy_subjects import HULLS_16, HULLS_68, INPUTS, LABELLED, LOOSENESS, MOTIONS, SCANS
 
@@ -120,6 +120,7 @@ def summary(cells: Sequence[Found]) -> str:
                 f"{SOURCES[source]} ({len(here)})",
                 *(with_bias(here, result) for result in RESULTS),
                 with_bias(here, DETAILED, "under_cloth"),
+                with_bias(here, DETAILED, "bare"),
                 with_bias(here, DETAILED, "direct"),
                 f"{np.mean([c['scan']['mean_mm'] for c in here]):.1f}",
                 _cloth(here),
@@ -130,6 +131,7 @@ def summary(cells: Sequence[Found]) -> str:
         "source (cells)",
         *(NAMES[r] for r in RESULTS),
         "detailed, under cloth",
+        "detailed, bare parts",
         "detailed, direct",
         "input itself, mean mm outside",
         "cloth: true, expected mm",
@@ -304,13 +306,12 @@ def cells_csv(cells: Sequence[Found]) -> str:
     """A row a cell and result."""
     out = io.StringIO()
     facts = ["seed", "outfit", "motion", "source", "n_frames", "used"]
-    measures = ["paper", "under_cloth", "direct"]
     numbers = ["rms", "mean", "bias", "p90"]
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([*facts, "result", *(f"{m}_{n}_mm" for m in measures for n in numbers)])
+    writer.writerow([*facts, "result", *(f"{m}_{n}_mm" for m in MEASURES for n in numbers)])
     for c in cells:
         for result, errors in c["errors"].items():
-            values = [f"{errors[m][n]:.4f}" for m in measures for n in numbers]
+            values = [f"{errors.get(m, {}).get(n, float('nan')):.4f}" for m in MEASURES for n in numbers]
             writer.writerow([*(c["cell"][f] for f in facts), result, *values])
     return out.getvalue()
 

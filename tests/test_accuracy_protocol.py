@@ -100,12 +100,12 @@ def test_a_ball_two_millimetres_too_big_scores_two_millimetres_too_fat() -> None
     result = Surface(truth * (0.302 / 0.3), faces)
     everywhere = np.ones(len(truth), dtype=bool)
     posed = Posed(result, np.ones((len(truth), 1)), np.zeros((1, 3)), np.array([-1]))
-    found = score(posed, truth, faces, everywhere, truth[:, 2] > 0)
+    found = score(posed, truth, faces, everywhere, truth[:, 2] > 0, truth[:, 2] < 0)
     for summary_of in (found.paper, found.direct):
         assert summary_of.rms == pytest.approx(2.0, abs=0.1)
         assert summary_of.bias == pytest.approx(2.0, abs=0.1)
     moved = replace(posed, surface=Surface(result.vertices + np.array([0.01, 0.0, 0.0]), faces))
-    again = score(moved, truth, faces, everywhere, truth[:, 2] > 0)
+    again = score(moved, truth, faces, everywhere, truth[:, 2] > 0, truth[:, 2] < 0)
     assert again.paper.rms == pytest.approx(2.0, abs=0.1), "the paper's measure scores shape, not place"
     assert again.direct.rms > 5.0
 
@@ -157,7 +157,7 @@ def cell_of(seed: int, source: str, fusion: float, detailed: float) -> dict:
 
     def error(size: float) -> dict:
         one = {"rms": size, "mean": size, "bias": -size, "p90": size}
-        return {"paper": one, "under_cloth": one, "direct": one}
+        return {"paper": one, "under_cloth": one, "bare": one, "direct": one}
 
     return {
         "cell": {"seed": seed, "outfit": "tshirt-shorts", "motion": "hips", "source": source,
