@@ -40,6 +40,7 @@ from fit.body.pose_prior import PosePrior
 from fit.closest import Container
 from fit.evaluate import Surface, average, signed_error_mm
 from fit.fuse import FusionShape, fused, usable
+from fit.hull_excess import hull_excess
 from fit.initialise import PoseFinder
 from fit.settings import FitSettings
 from fit.skin import labelled
@@ -112,7 +113,7 @@ def _fit(
     fitter, finder = _tools()
     first = align_sequence(fitter, finder, [(k, s, None) for k, s in scans.items()], settings)
     scans, shares = labelled(fitter, scans, first, settings)
-    fusion, alignments = fused(fitter, finder, first, settings, shares)
+    fusion, alignments = fused(fitter, finder, first, settings, shares, hull_excess(fitter, scans, first))
     track = track_sequence(fitter, finder, fusion, alignments, scans, settings, container_of=container_of)
     return Fitted(first, alignments, fusion, track, time.perf_counter() - started)
 

@@ -25,6 +25,7 @@ from fit.body.model import BodyModel, load_body
 from fit.body.pose_prior import PosePrior
 from fit.frames import apply
 from fit.fuse import FusionShape, fused
+from fit.hull_excess import hull_excess
 from fit.initialise import PoseFinder
 from fit.settings import FitSettings
 from fit.skin import labelled
@@ -90,7 +91,8 @@ def fit_stage(config: RunConfig, settings: FitSettings | None = None) -> None:
     if config.labels != "none":
         scans, shares = labelled(fitter, scans, alignments, settings)
     _save_labels(folder, shares)
-    fusion, alignments = fused(fitter, finder, alignments, settings, shares)
+    excess = hull_excess(fitter, scans, alignments)
+    fusion, alignments = fused(fitter, finder, alignments, settings, shares, excess)
     _save_fusion(folder, model, fusion, world_from_body)
     with tqdm(total=len(alignments), desc="track", unit="frame") as bar:
         track = track_sequence(

@@ -87,10 +87,11 @@ def fused(
     alignments: Sequence[Alignment],
     settings: FitSettings,
     skin_shares: Mapping[int, Float[np.ndarray, "_v"]] | None = None,
+    excess: Float[np.ndarray, "_v"] | None = None,
 ) -> tuple[FusionShape, list[Alignment]]:
     """The fusion shape, and the alignments with the poses to track from.
 
-    skin_shares: g of every vertex (V) by frame number, where skin was told from cloth.
+    skin_shares: g of every vertex (V) by frame number, where skin was told from cloth; excess: `hull_excess`.
 
     Where the clothes' movement can be read, one shape and all poses are found at once; else every frame keeps
     the pose it was aligned with. Raises ValueError when no frame was aligned.
@@ -99,7 +100,7 @@ def fused(
     if not settings.at_once or not can_be_together(good, trust_in_spread(good, settings)):
         return fuse(fitter, alignments, settings, skin_shares), list(alignments)
     bare = None if skin_shares is None else np.mean([skin_shares[a.frame_id] for a in good], axis=0)
-    together = fit_together(fitter, finder, good, settings, bare)
+    together = fit_together(fitter, finder, good, settings, bare, excess)
     again = together.realigned(fitter, good)
     by_frame = {a.frame_id: a for a in again}
     # A suspect frame does not speak for the shape, but it is tracked like the others.

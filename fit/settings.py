@@ -65,15 +65,15 @@ def _track_template() -> StageWeights:
 class ThicknessSettings:
     """How movement of the cloth tells its thickness (`fit.thickness`).
 
-    per_movement: factor on the ratio of thickness to deviation along the normal; thinnest_m: what cloth that
-    never moves (and the hull's own excess) stands away; swing_m: movement whose thickness is half of what the
+    per_movement: factor on the ratio of thickness to deviation along the normal; excess_share: of a
+    hull's expected excess that alignments follow; swing_m: movement whose thickness is half of what the
     ratio says; tolerance_share: how far that may be off; tolerance_m, noise_m: tolerance and deviation where
     there is no cloth; largest_movement_m: more is no cloth either; pooling_rounds: means over neighbours
     before deviations are compared.
     """
 
     per_movement: float = 1.0
-    thinnest_m: float = 0.001
+    excess_share: float = 0.9
     swing_m: float = 0.04
     tolerance_share: float = 0.4
     tolerance_m: float = 0.002

@@ -25,9 +25,9 @@ from fit.settings import ThicknessSettings
 #: seat, where a shirt hangs over trousers, two layers add up while their movements do not. Means over four
 #: foreign and eight own sequences from none to baggy, of single values between 2 and 6.
 _PER_MOVEMENT = {
-    "pelvis": 5.1, "spine1": 4.1, "spine2": 3.6, "spine3": 3.7, "neck": 2.7, "head": 2.7, "collar": 3.0,
-    "shoulder": 3.3, "elbow": 2.8, "wrist": 2.8, "hand": 2.8, "hip": 3.7, "knee": 3.2, "ankle": 3.2,
-    "foot": 2.8,
+    "pelvis": 4.3, "spine1": 3.8, "spine2": 3.1, "spine3": 3.3, "neck": 2.5, "head": 2.5, "collar": 2.7,
+    "shoulder": 2.4, "elbow": 2.5, "wrist": 2.5, "hand": 2.5, "hip": 3.4, "knee": 2.9, "ankle": 2.9,
+    "foot": 2.5,
 }  # fmt: skip
 
 
@@ -85,11 +85,13 @@ def expected_thickness(
     ratio: Float[np.ndarray, "v"],
     faces: Int[np.ndarray, "f 3"],
     settings: ThicknessSettings,
+    excess: Float[np.ndarray, "v"] | float = 0.0,
 ) -> Thickness:
     """From offsets of the cloth to the body along the normal (m, positive outwards) in all frames.
 
-    noise: deviation (m) that is not cloth (`bending_noise`); ratio: `thickness_per_movement`. Deviations are
-    pooled over the neighbourhood before they are compared.
+    noise: deviation (m) that is not cloth (`bending_noise`); ratio: `thickness_per_movement`; excess: how far
+    what was measured stands off the cloth. Deviations are pooled over the neighbourhood before they are
+    compared.
     """
     # One frame with an arm against the trunk must not pass for a coat.
     variance = np.minimum(robust_variance(offsets), settings.largest_movement_m**2)
@@ -98,7 +100,7 @@ def expected_thickness(
     movement = np.sqrt(np.maximum(variance - own, 0.0))
     # Cloth that swings by centimetres does not stand away in proportion.
     damped = movement / (1.0 + movement / settings.swing_m)
-    expected = settings.thinnest_m + settings.per_movement * ratio * damped
+    expected = settings.excess_share * excess + settings.per_movement * ratio * damped
     tolerance = np.sqrt(settings.tolerance_m**2 + own + (settings.tolerance_share * expected) ** 2)
     return Thickness(expected, tolerance, movement)
 

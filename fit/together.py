@@ -70,14 +70,16 @@ class _Frames:
 
 @dataclass(frozen=True)
 class _Cloth:
-    """The posed alignments: vertices and normals (T V 3); part_weight, ratio, bare (V): how much a vertex's
-    part counts, `thickness_per_movement`, and how surely it is known to be bare skin."""
+    """The posed alignments: vertices and normals (T V 3); part_weight, ratio, bare, excess (V): how much a
+    vertex's part counts, `thickness_per_movement`, how surely it is known to be bare skin, and how far hulls
+    stand off there (m)."""
 
     vertices: Float[np.ndarray, "t v 3"]
     normals: Float[np.ndarray, "t v 3"]
     part_weight: Float[np.ndarray, "v"]
     ratio: Float[np.ndarray, "v"]
     bare: Float[np.ndarray, "v"]
+    excess: Float[np.ndarray, "v"]
 
 
 def can_be_together(alignments: Sequence[Alignment], trust: float) -> bool:
@@ -91,6 +93,7 @@ def fit_together(
     alignments: Sequence[Alignment],
     settings: FitSettings,
     bare: Float[np.ndarray, "v"] | None = None,
+    excess: Float[np.ndarray, "v"] | None = None,
 ) -> Together:
     """Minimise over betas and all poses
 
@@ -100,6 +103,7 @@ def fit_together(
     The thickness is estimated anew every round from the same residuals. Shapes have to explain all frames, so
     at most `shape_frames` of them (evenly spread) take part in finding the betas; the others' poses follow.
     bare (V): share of the frames in which a vertex was seen to be bare skin: it holds pose and shape there.
+    excess (V): how far the alignments stand off the cloth because hulls do (m).
     """
     from threadpoolctl import threadpool_limits
 
@@ -111,6 +115,7 @@ def fit_together(
         np.where(np.isin(region_of_vertices(fitter.model), VAGUE_PARTS), VAGUE_WEIGHT, 1.0),
         thickness_per_movement(fitter.model),
         np.zeros(fitter.model.n_vertices) if bare is None else bare,
+        np.zeros(fitter.model.n_vertices) if excess is None else excess,
     )
     at = _Frames(
         np.stack([a.state.pose for a in alignments]),
@@ -196,7 +201,9 @@ def _round(
         noise = bending_noise(model, at.poses[chosen], vertex_normals(template, model.faces))
         offsets = np.stack([f[2] for f in frames])
         lost = lost_points(offsets)
-        thickness = expected_thickness(offsets, noise, cloth.ratio, model.faces, settings.thickness)
+        thickness = expected_thickness(
+            offsets, noise, cloth.ratio, model.faces, settings.thickness, cloth.excess
+        )
         thickness = undressed(thickness, cloth.bare, settings.thickness)
     n_betas = 0 if held is not None else model.n_betas
     shape_prior = weights.shape_prior * len(chosen)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from hull.slack import expected_excess
 from hull.visual_hull import Hull
 
 # Median slack (metres) up to which all places count alike, and from which they count by their slack.
@@ -32,6 +33,7 @@ class Scan:
     weight : (N,) how much the point counts; 1 is an ordinary one.
     colours : (N 3) RGB, or None where nobody took a picture.
     skin_share : (N,) g of the paper: 0 for cloth, near 1 deep inside a bare region; None: `is_skin` as it is.
+    excess_m : (N,) how far the points may be expected to stand off what was seen (`hull.slack`); None: not.
     """
 
     points: Float[np.ndarray, "n 3"]
@@ -41,6 +43,7 @@ class Scan:
     weight: Float[np.ndarray, " n"]
     colours: UInt8[np.ndarray, "n 3"] | None = None
     skin_share: Float[np.ndarray, " n"] | None = None
+    excess_m: Float[np.ndarray, " n"] | None = None
 
     @staticmethod
     def from_hull(
@@ -53,11 +56,11 @@ class Scan:
         The same hull, number and seed give the same points. Normals are the vertices', interpolated; weights
         are `trust`, one on average.
         """
-        trusted = trust(hull.slack_m)
+        trusted, excess = trust(hull.slack_m), expected_excess(hull.slack_m)
         if n_points is None:
             n = len(hull.vertices)
             bare = np.zeros(n, dtype=bool) if is_skin is None else is_skin
-            return Scan(hull.vertices, hull.normals, hull.faces, bare, trusted, hull.colours)
+            return Scan(hull.vertices, hull.normals, hull.faces, bare, trusted, hull.colours, excess_m=excess)
         face_idx, barycentric = even_samples(hull.vertices, hull.faces, n_points, seed)
         corners = hull.faces[face_idx]
         points = np.einsum("nk,nki->ni", barycentric, hull.vertices[corners])
@@ -76,7 +79,8 @@ class Scan:
         if hull.colours is not None:
             mixed = np.einsum("nk,nkc->nc", barycentric, hull.colours[corners].astype(float))
             colours = np.round(mixed).astype(np.uint8)
-        return Scan(points, normals, None, bare, weight, colours)
+        stand_off = np.einsum("nk,nk->n", barycentric, excess[corners])
+        return Scan(points, normals, None, bare, weight, colours, excess_m=stand_off)
 
 
 def trust(slack_m: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:

@@ -28,6 +28,9 @@ _NUDGE_PX = 0.5
 # Slack is measured at no more vertices than this and spread to their neighbours: it changes slowly, and finer
 # grids should not cost more rays.
 MAX_MEASURED = 24_000
+#: Excess over the product of a place's slack and the hull's median slack; more slack than the second says
+#: phantom, not excess.
+EXCESS_PER_M, LARGEST_SLACK_M = 2.7, 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +129,18 @@ def slack_at(
     slack = np.full(n, np.inf)
     np.minimum.at(slack, at, room)
     return np.where(np.isfinite(slack), slack, np.nan)
+
+
+def expected_excess(slack_m: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
+    """(V,) metres: how far a hull may be expected to stand away from what it contains.
+
+    Between two outlines that touch a round surface the hull stands off by the sagitta: slack times the angle
+    between the cameras' tangents over eight. The angle is the same for the whole rig, and the median slack
+    measures it. EXCESS_PER_M is from hulls of people, dressed and not, by 8 to 68 cameras: means of 4.8 to
+    6.2 mm with 8, 2.2 to 2.8 with 16, 1.3 to 1.7 with 32, 0.7 to 1.0 with 68; a single place may differ by as
+    much again.
+    """
+    return EXCESS_PER_M * float(np.median(slack_m)) * np.minimum(slack_m, LARGEST_SLACK_M)
 
 
 def spread_to_neighbours(
