@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fit.coarse import CoarsePose, CoarseScan
-from fit.initialise import LOST, PoseFinder, unwrap_root
+from fit.initialise import PoseFinder, unwrap_root
 from fit.settings import FitSettings
 from fit.solver import Fitter, Objective, ScanPoints, Unknowns, minimise
 from fit.state import BodyState
@@ -22,6 +22,8 @@ from hull.scan import Scan
 
 #: So many points tell the pose; the template then takes all of them.
 POSE_POINTS = 12_000
+#: A score this much worse than the best frame's means that the previous pose did not carry over.
+LOST = 1.10
 #: Alignments whose points stay this far away on average are marked: the pose is probably wrong.
 SUSPICIOUS_M = 0.03
 

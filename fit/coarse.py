@@ -144,16 +144,38 @@ class CoarseBody:
 
     def jacobian(self, posed: _Posed) -> Float[np.ndarray, "n 3 p"]:
         """dv / d(rotation vectors in the parents' frames (3 J), translation (3), betas)."""
+        return self.jacobian_in_world(posed) @ self.world_turns(posed)
+
+    def world_turns(self, posed: _Posed) -> Float[np.ndarray, "p p"]:
+        """Columns of `jacobian_in_world` from the parameters: a rotation vector in its parent's frame turned
+        into the world's."""
+        n_joints = len(self.parents)
+        frames = np.stack([np.eye(3) if p < 0 else posed.world[p] for p in self.parents])
+        turns = np.zeros((3, n_joints, n_joints, 3))
+        each = np.arange(n_joints)
+        turns[:, each, each] = frames.transpose(1, 0, 2)
+        out = np.eye(3 * n_joints + 3 + self.n_betas)
+        out[: 3 * n_joints, : 3 * n_joints] = turns.reshape(3 * n_joints, 3 * n_joints)
+        return out
+
+    def jacobian_in_world(
+        self, posed: _Posed, out: Float[np.ndarray, "n 3 p"] | None = None
+    ) -> Float[np.ndarray, "n 3 p"]:
+        """The same with rotations about the world's axes (all joints about x, then y, then z): a cross
+        product is then a copy of numbers, and turning the small normal equations costs nothing.
+
+        out: what an earlier call returned, to be filled anew (fresh memory costs as much as the numbers).
+        """
         n, n_joints = len(self.rest), len(self.parents)
         moment = np.matmul(self.descends, posed.by_bone)
         share = self.weights @ self.descends.T
         arm = moment - share[:, :, None] * posed.origin
-        parent_frame = np.stack([np.eye(3) if p < 0 else posed.world[p] for p in self.parents])
-        out = np.empty((n, 3, 3 * n_joints + 3 + self.n_betas))
-        axes = parent_frame.transpose(0, 2, 1)  # (J, which axis, xyz)
-        out[:, :, : 3 * n_joints] = (
-            np.cross(axes[None], arm[:, :, None, :]).transpose(0, 3, 1, 2).reshape(n, 3, -1)
-        )
+        out = np.zeros((n, 3, 3 * n_joints + 3 + self.n_betas)) if out is None else out
+        for axis in range(3):
+            after, last = (axis + 1) % 3, (axis + 2) % 3
+            turns = slice(axis * n_joints, (axis + 1) * n_joints)
+            out[:, last, turns] = arm[:, :, after]
+            out[:, after, turns] = -arm[:, :, last]
         out[:, :, 3 * n_joints : 3 * n_joints + 3] = np.eye(3)
         # Betas move the vertex in its bones' frames, and the joints under it.
         shape = np.einsum("nab,nbk->nak", posed.blended, self.shape)
@@ -240,10 +262,11 @@ def refine(
     at = start
     n, n_joints = body.n_surface, len(body.parents)
     size = 3 * n_joints + 3 + body.n_betas
+    jacobian: np.ndarray | None = None
     for sigma in sigmas_m:
         for _ in range(iterations):
             posed = body.forward(at)
-            jacobian = body.jacobian(posed)
+            jacobian = body.jacobian_in_world(posed, jacobian)
             hessian, rhs = np.zeros((size, size)), np.zeros(size)
             if scan is not None:
                 own = np.hstack([posed.points[:n], NORMAL_WEIGHT_M * posed.normals[:n]])
@@ -278,6 +301,9 @@ def refine(
                 flat = jacobian[n:].reshape(-1, size)
                 hessian += flat.T @ (np.repeat(weight, 3)[:, None] * flat)
                 rhs += flat.T @ (np.repeat(weight, 3) * gap.ravel())
+            turns_in_world = body.world_turns(posed)
+            hessian = turns_in_world.T @ hessian @ turns_in_world
+            rhs = turns_in_world.T @ rhs
             inner = slice(3, 3 * n_joints)
             turn = np.zeros((3 * n_joints - 3, 3 * n_joints - 3))
             for j, block in enumerate(left_jacobian_inverse(at.pose[1:])):

@@ -7,7 +7,7 @@ landmarks for this (section 5.1).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,16 +16,19 @@ from scipy.spatial.transform import Rotation
 
 from fit.body.model import BodyModel
 from fit.coarse import CoarseBody, CoarsePose, CoarsePrior, CoarseScan, Targets, refine, score
+from fit.limb_seeds import ARMS, LEGS, arm_configurations, leg_configurations, stances
 
 if TYPE_CHECKING:
     from fit.body.pose_prior import PosePrior
 
 N_HEADINGS = 8
 KEPT = 3
-#: Arm configurations refined a side, out of all that arm_configurations() lists.
-REFINED_ARMS = 6
-#: SMPL joint numbers from collar to wrist.
-ARMS = ((13, 16, 18, 20), (14, 17, 19, 21))
+#: The search among many starts is done with so many vertices, the rest with all of the coarse body's.
+QUICK_VERTICES = 350
+#: (sigma m, iterations, how many of the best go on) of the search.
+SEARCH = ((0.3, 6, 8), (0.15, 6, 4), (0.08, 6, 4), (0.05, 6, 4))
+#: Configurations refined a limb, out of all that limb_seeds.py lists.
+REFINED_ARMS, REFINED_LEGS = 6, 4
 COARSE_TO_FINE_M = (0.3, 0.15, 0.08, 0.05)
 #: Facing ways this far apart, rad, are different hypotheses.
 OTHER_HEADING = 1.0
@@ -39,7 +42,9 @@ class PoseFinder:
 
     body: CoarseBody
     prior: CoarsePrior
+    quick: CoarseBody
     arm_seeds: Float[np.ndarray, "2 s 4 3"]
+    leg_seeds: Float[np.ndarray, "2 l 3 3"]
     n_model_betas: int
 
     @staticmethod
@@ -48,7 +53,9 @@ class PoseFinder:
         return PoseFinder(
             CoarseBody.of(model),
             CoarsePrior(prior.mean, np.linalg.inv(prior.covariance)),
+            CoarseBody.of(model, QUICK_VERTICES),
             arm_configurations(),
+            leg_configurations(),
             model.shape_directions.shape[2],
         )
 
@@ -56,9 +63,15 @@ class PoseFinder:
         """The prior's mean with an upright root."""
         return np.vstack([np.zeros(3), self.prior.mean.reshape(-1, 3)])
 
-    def facing(self, scan: CoarseScan, heading_rad: float, betas: np.ndarray) -> CoarsePose:
-        """The mean pose turned about the vertical, its centre on the scan's."""
-        pose = self.mean_pose()
+    def facing(
+        self,
+        scan: CoarseScan,
+        heading_rad: float,
+        betas: np.ndarray,
+        stance: Float[np.ndarray, "j 3"] | None = None,
+    ) -> CoarsePose:
+        """A stance (the mean pose unless given) turned about the vertical, its centre on the scan's."""
+        pose = self.mean_pose() if stance is None else stance.copy()
         pose[0] = [0.0, heading_rad, 0.0]
         at = CoarsePose(pose, np.zeros(3), betas)
         points = self.body.forward(at).points[: self.body.n_surface]
@@ -89,41 +102,54 @@ class PoseFinder:
     def from_hull(self, scan: CoarseScan, betas: np.ndarray | None = None) -> list[CoarsePose]:
         """Hypotheses from the hull alone, best first. betas: of the same person in another frame, if
         known."""
-        starts = [np.zeros(self.n_model_betas), self.standing_betas(scan)] if betas is None else [betas]
+        stands, low = stances(self.mean_pose())
+        none = np.zeros(self.n_model_betas)
+        bodies = [(stands, none), (stands, self.standing_betas(scan)), (low, none)]
+        if betas is not None:
+            bodies = [(stands, betas), (low, betas)]
         headings = 2.0 * np.pi * np.arange(N_HEADINGS) / N_HEADINGS
-        tried = [self.facing(scan, heading, first) for heading in headings for first in starts]
-        for sigma, iterations, kept in (
-            (0.3, 6, 2 * KEPT),
-            (0.15, 6, KEPT),
-            (0.08, 6, KEPT),
-            (0.05, 6, KEPT),
-        ):
-            tried = [refine(self.body, scan, self.prior, at, (sigma,), iterations) for at in tried]
+        tried = [self.facing(scan, heading, b, stance) for heading in headings for stance, b in bodies]
+        for sigma, iterations, kept in SEARCH:
+            tried = [refine(self.quick, scan, self.prior, at, (sigma,), iterations) for at in tried]
             tried = sorted(tried, key=lambda at: at.score)[:kept]
         best = tried[0]
-        reseeded = [self.reseed_arms(scan, best)]
-        # The best of those that face another way has its arms tried too: it might be the true one with an arm
-        # lost.
+        # The best of those that face another way has its limbs tried too: it might be the true one with an
+        # arm lost.
         others = [at for at in tried[1:] if heading_difference(at, best) > OTHER_HEADING]
-        reseeded += [self.reseed_arms(scan, at) for at in others[:1]]
-        return sorted(reseeded, key=lambda at: at.score)
+        reseeded = [self.reseed(scan, at) for at in [best, *others[:1]]]
+        fine = [refine(self.body, scan, self.prior, at, COARSE_TO_FINE_M[2:], 4) for at in reseeded]
+        return sorted(fine, key=lambda at: at.score)
 
-    def reseed_arms(self, scan: CoarseScan, at: CoarsePose) -> CoarsePose:
-        """Try other arm configurations, one side at a time; keep what scores best."""
-        for arm, seeds in zip(ARMS, self.arm_seeds, strict=True):
-            trials = []
-            for seed in seeds:
-                pose = at.pose.copy()
-                pose[list(arm)] = seed
-                trial = CoarsePose(pose, at.translation, at.betas)
-                trials.append(CoarsePose(pose, at.translation, at.betas, self.score(scan, trial)))
-            best = at
-            for start in sorted(trials, key=lambda trial: trial.score)[:REFINED_ARMS]:
-                trial = refine(self.body, scan, self.prior, start, COARSE_TO_FINE_M[2:], iterations=4)
-                if trial.score < best.score:
-                    best = trial
-            at = best
+    def reseed(self, scan: CoarseScan, at: CoarsePose) -> CoarsePose:
+        """Try other configurations of arms and legs, one limb at a time; keep what scores best."""
+        for limbs, seeds, refined in (
+            (ARMS, self.arm_seeds, REFINED_ARMS),
+            (LEGS, self.leg_seeds, REFINED_LEGS),
+        ):
+            for limb, own_seeds in zip(limbs, seeds, strict=True):
+                at = self._reseed_limb(scan, at, limb, own_seeds, refined)
         return at
+
+    def _reseed_limb(
+        self,
+        scan: CoarseScan,
+        at: CoarsePose,
+        limb: tuple[int, ...],
+        seeds: Float[np.ndarray, "s k 3"],
+        refined: int,
+    ) -> CoarsePose:
+        trials = []
+        for seed in seeds:
+            pose = at.pose.copy()
+            pose[list(limb)] = seed
+            trial = CoarsePose(pose, at.translation, at.betas)
+            trials.append(replace(trial, score=score(self.quick, scan, trial)))
+        best = at
+        for start in sorted(trials, key=lambda trial: trial.score)[:refined]:
+            trial = refine(self.quick, scan, self.prior, start, COARSE_TO_FINE_M[2:], iterations=4)
+            if trial.score < best.score:
+                best = trial
+        return best
 
     def from_previous(
         self, scan: CoarseScan, previous: CoarsePose, previous_centroid: np.ndarray
@@ -168,32 +194,6 @@ class PoseFinder:
     def score(self, scan: CoarseScan, at: CoarsePose) -> float:
         """Mean symmetric distance, m."""
         return score(self.body, scan, at)
-
-
-def arm_configurations() -> Float[np.ndarray, "2 s 4 3"]:
-    """Rotation vectors of collar, shoulder, elbow, wrist for the left and the right arm, over all that arms
-    do.
-
-    Upper arms point in ten directions around the shoulder, with the elbow nearly straight; in five of them
-    also bent. From the T-pose, x to the body's left, y up, z to the front.
-    """
-    directions = {
-        "down": (0.15, -1.0, 0.05), "side": (1.0, 0.0, 0.0), "front": (0.1, -0.1, 1.0),
-        "up": (0.25, 1.0, 0.0), "up front": (0.3, 0.7, 0.7), "up side": (0.7, 0.7, 0.0),
-        "down front": (0.2, -0.7, 0.7),
-        "down side": (0.7, -0.7, 0.1), "across": (-0.4, -0.2, 1.0), "down back": (0.3, -0.8, -0.5),
-    }  # fmt: skip
-    bent = ("down", "side", "front", "up side", "down front")
-    rows = []
-    for name, direction in directions.items():
-        to = np.asarray(direction) / np.linalg.norm(direction)
-        axis = np.cross([1.0, 0.0, 0.0], to)
-        length = np.linalg.norm(axis)
-        shoulder = axis / max(length, 1e-9) * np.arctan2(length, to[0])
-        for flexion in (0.3, 1.6) if name in bent else (0.3,):
-            rows.append([np.zeros(3), shoulder, np.array([0.0, -flexion, 0.0]), np.zeros(3)])
-    left = np.array(rows)
-    return np.stack([left, left * np.array([1.0, -1.0, -1.0])])
 
 
 def heading_difference(a: CoarsePose, b: CoarsePose) -> float:
