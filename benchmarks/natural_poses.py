@@ -1,5 +1,5 @@
-"""Random poses as people take them, for benchmarks: legs that stand, walk, sit, squat or lunge, under arms that
-hang, reach, cross, rest on hips or thighs, or hold a telephone.
+"""Random poses as people take them, for benchmarks: legs that stand, walk, sit, squat or lunge, under arms
+that hang, reach, cross, rest on hips or thighs, or hold a telephone.
 
 A third comes from the pose prior, a third is a frame of the synthetic motions, a third is put together here
 from legs, trunk and arms. Hands are brought where they go by a small inverse kinematics. Poses in which limbs
@@ -190,8 +190,8 @@ def _walks(rng: Random) -> Angles:
 
 
 _LEGS: tuple[Callable[[Random], Angles], ...] = (
-    _stands, _stands, _walks, _walks, _stands_on_one_leg, _stands_legs_crossed, _sits, _sits, _sits_one_leg_over,
-    _squats, _lunges, _kneels_on_one_knee, _steps_aside, _bends_down,
+    _stands, _stands, _walks, _walks, _stands_on_one_leg, _stands_legs_crossed, _sits, _sits,
+    _sits_one_leg_over, _squats, _lunges, _kneels_on_one_knee, _steps_aside, _bends_down,
 )  # fmt: skip
 
 # Arms: shoulders and elbows. Places are of the rest pose, before the trunk bends.
@@ -298,8 +298,8 @@ def _on_the_head(rng: Random, joints: np.ndarray) -> Angles:
 def _telephone(rng: Random, joints: np.ndarray) -> Angles:
     side, sign = (("left", 1.0), ("right", -1.0))[int(rng.integers(2))]
     head = joints[JOINT["head"]]
-    ear = head + (0.15 * sign, 0.0, 0.09)
-    return _hang(rng, joints) | arm_to(side, joints, ear, head + (0.3 * sign, -0.32, 0.12))
+    ear = head + np.array([0.15 * sign, 0.0, 0.09])
+    return _hang(rng, joints) | arm_to(side, joints, ear, head + np.array([0.3 * sign, -0.32, 0.12]))
 
 
 def _hold_something(rng: Random, joints: np.ndarray) -> Angles:
@@ -310,6 +310,6 @@ def _hold_something(rng: Random, joints: np.ndarray) -> Angles:
 
 
 _ARMS: tuple[Callable[[Random, np.ndarray], Angles], ...] = (
-    _hang, _hang, _raised, _out, _one_reaches, _one_reaches, _crossed, _on_hips, _behind_the_back, _on_the_head,
-    _telephone, _hold_something,
+    _hang, _hang, _raised, _out, _one_reaches, _one_reaches, _crossed, _on_hips, _behind_the_back,
+    _on_the_head, _telephone, _hold_something,
 )  # fmt: skip

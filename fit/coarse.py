@@ -22,6 +22,8 @@ from fit.surface import vertex_areas, vertex_normals
 NORMAL_WEIGHT_M = 0.08
 #: The score's cut-off: a point farther than this says nothing about how far.
 SCORE_CUT_M = 0.10
+#: Farther from the body than clothes are, and than the vertices of the coarse body are from each other.
+LEFT_OUT_M = 0.12
 #: Share of the point-to-point part beside the point-to-plane part, for pairs found from the body and from the
 #: scan.
 BODY_GLUE, SCAN_GLUE = 0.05, 0.4
@@ -228,12 +230,22 @@ def left_jacobian_inverse(rotation_vector: Float[np.ndarray, "m 3"]) -> Float[np
 
 @dataclass(frozen=True)
 class CoarsePrior:
-    """Gaussian over all joints but the root: mean (3 (J-1)), precision; weights of pose and betas."""
+    """Gaussian over all joints but the root: mean (3 (J-1)), precision; weights of pose and betas.
+
+    pose_weight holds at sigma_m and above. Below, the weight falls with the square of sigma, as that of
+    residuals of this size would: what is near the scan already must not be pulled off it because few people
+    hold their hands on their heads.
+    """
 
     mean: Float[np.ndarray, "m"]
     precision: Float[np.ndarray, "m m"]
     pose_weight: float = 0.004
+    sigma_m: float = 0.15
     betas_weight: float = 0.01
+
+    def weight_at(self, sigma_m: float) -> float:
+        """Weight of the pose beside pairs of this scale."""
+        return self.pose_weight * min(1.0, (sigma_m / self.sigma_m) ** 2)
 
 
 def score(body: CoarseBody, scan: CoarseScan, at: CoarsePose) -> float:
@@ -243,6 +255,13 @@ def score(body: CoarseBody, scan: CoarseScan, at: CoarsePose) -> float:
     to_scan = scan.tree.query(own)[0]
     to_body = cKDTree(own).query(scan.tree.data[:: scan.stride])[0]
     return float(0.5 * (np.minimum(to_scan, SCORE_CUT_M).mean() + np.minimum(to_body, SCORE_CUT_M).mean()))
+
+
+def left_out(body: CoarseBody, scan: CoarseScan, at: CoarsePose) -> float:
+    """Share of the scan's points that are farther than LEFT_OUT_M from every vertex of the body."""
+    points = body.forward(at).points[: body.n_surface]
+    asked = scan.points[:: scan.stride]
+    return float((cKDTree(points).query(asked, distance_upper_bound=LEFT_OUT_M)[0] == np.inf).mean())
 
 
 def refine(
@@ -264,6 +283,7 @@ def refine(
     size = 3 * n_joints + 3 + body.n_betas
     jacobian: np.ndarray | None = None
     for sigma in sigmas_m:
+        pose_weight = prior.weight_at(sigma)
         for _ in range(iterations):
             posed = body.forward(at)
             jacobian = body.jacobian_in_world(posed, jacobian)
@@ -308,8 +328,8 @@ def refine(
             turn = np.zeros((3 * n_joints - 3, 3 * n_joints - 3))
             for j, block in enumerate(left_jacobian_inverse(at.pose[1:])):
                 turn[3 * j : 3 * j + 3, 3 * j : 3 * j + 3] = block
-            hessian[inner, inner] += prior.pose_weight * turn.T @ prior.precision @ turn
-            rhs[inner] -= prior.pose_weight * turn.T @ (prior.precision @ (at.pose[1:].ravel() - prior.mean))
+            hessian[inner, inner] += pose_weight * turn.T @ prior.precision @ turn
+            rhs[inner] -= pose_weight * turn.T @ (prior.precision @ (at.pose[1:].ravel() - prior.mean))
             betas = slice(3 * n_joints + 3, size)
             hessian[betas, betas] += prior.betas_weight * np.eye(body.n_betas)
             rhs[betas] -= prior.betas_weight * at.betas[: body.n_betas]

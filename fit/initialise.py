@@ -7,6 +7,7 @@ landmarks for this (section 5.1).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -15,7 +16,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from fit.body.model import BodyModel
-from fit.coarse import CoarseBody, CoarsePose, CoarsePrior, CoarseScan, Targets, refine, score
+from fit.coarse import CoarseBody, CoarsePose, CoarsePrior, CoarseScan, Targets, left_out, refine, score
 from fit.limb_seeds import ARMS, LEGS, arm_configurations, leg_configurations, stances
 
 if TYPE_CHECKING:
@@ -29,6 +30,8 @@ QUICK_VERTICES = 350
 SEARCH = ((0.3, 6, 8), (0.15, 6, 4), (0.08, 6, 4), (0.05, 6, 4))
 #: Configurations refined a limb, out of all that limb_seeds.py lists.
 REFINED_ARMS, REFINED_LEGS = 6, 4
+#: A larger share of the scan far from the body means that a limb is not where it should be.
+LEFT_OUT = 0.01
 COARSE_TO_FINE_M = (0.3, 0.15, 0.08, 0.05)
 #: Facing ways this far apart, rad, are different hypotheses.
 OTHER_HEADING = 1.0
@@ -99,9 +102,9 @@ class PoseFinder:
         betas[0] = np.clip((wanted - height(0.0)) / slope, -3.0, 3.0) if abs(slope) > 1e-3 else 0.0
         return betas
 
-    def from_hull(self, scan: CoarseScan, betas: np.ndarray | None = None) -> list[CoarsePose]:
-        """Hypotheses from the hull alone, best first. betas: of the same person in another frame, if
-        known."""
+    def search(self, scan: CoarseScan, betas: np.ndarray | None = None) -> list[CoarsePose]:
+        """Hypotheses from the hull alone, best first, limbs as they fell. betas: of the same person in
+        another frame, if known."""
         stands, low = stances(self.mean_pose())
         none = np.zeros(self.n_model_betas)
         bodies = [(stands, none), (stands, self.standing_betas(scan)), (low, none)]
@@ -112,6 +115,17 @@ class PoseFinder:
         for sigma, iterations, kept in SEARCH:
             tried = [refine(self.quick, scan, self.prior, at, (sigma,), iterations) for at in tried]
             tried = sorted(tried, key=lambda at: at.score)[:kept]
+        return tried
+
+    def from_hull(
+        self,
+        scan: CoarseScan,
+        betas: np.ndarray | None = None,
+        hypotheses: Sequence[CoarsePose] | None = None,
+    ) -> list[CoarsePose]:
+        """Hypotheses from the hull alone, best first, every limb tried elsewhere. hypotheses: of `search`,
+        where it was done already."""
+        tried = list(hypotheses) if hypotheses else self.search(scan, betas)
         best = tried[0]
         # The best of those that face another way has its limbs tried too: it might be the true one with an
         # arm lost.
@@ -121,13 +135,21 @@ class PoseFinder:
         return sorted(fine, key=lambda at: at.score)
 
     def reseed(self, scan: CoarseScan, at: CoarsePose) -> CoarsePose:
-        """Try other configurations of arms and legs, one limb at a time; keep what scores best."""
-        for limbs, seeds, refined in (
-            (ARMS, self.arm_seeds, REFINED_ARMS),
-            (LEGS, self.leg_seeds, REFINED_LEGS),
-        ):
-            for limb, own_seeds in zip(limbs, seeds, strict=True):
-                at = self._reseed_limb(scan, at, limb, own_seeds, refined)
+        """Try other configurations of arms and legs, one limb at a time; keep what scores best.
+
+        Once more where a part of the scan is still far from all of the body: a limb may have stood in
+        another's place.
+        """
+        for _ in range(2):
+            before = at.score
+            for limbs, seeds, refined in (
+                (ARMS, self.arm_seeds, REFINED_ARMS),
+                (LEGS, self.leg_seeds, REFINED_LEGS),
+            ):
+                for limb, own_seeds in zip(limbs, seeds, strict=True):
+                    at = self._reseed_limb(scan, at, limb, own_seeds, refined)
+            if at.score == before or left_out(self.quick, scan, at) < LEFT_OUT:
+                break
         return at
 
     def _reseed_limb(
