@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
@@ -224,7 +225,7 @@ class AlignedFrames:
 
     def _usual(self, without: int | None = None) -> Usual:
         known = [k for k in sorted(self.signs) if k != without]
-        steps = [self._step(b, a) for a, b in zip(known[:-1], known[1:], strict=True)]
+        steps = [self._step(b, a) for a, b in pairwise(known)]
         return Usual.of([self.signs[k] for k in known], [s.metres for s in steps if s is not None])
 
 

@@ -30,6 +30,8 @@ QUICK_VERTICES = 350
 SEARCH = ((0.3, 6, 8), (0.15, 6, 4), (0.08, 6, 4), (0.05, 6, 4))
 #: Configurations refined a limb, out of all that limb_seeds.py lists.
 REFINED_ARMS, REFINED_LEGS = 6, 4
+#: Hypotheses whose joints are this near on average are one.
+SAME_M = 0.03
 #: A larger share of the scan far from the body means that a limb is not where it should be.
 LEFT_OUT = 0.01
 COARSE_TO_FINE_M = (0.3, 0.15, 0.08, 0.05)
@@ -114,8 +116,19 @@ class PoseFinder:
         tried = [self.facing(scan, heading, b, stance) for heading in headings for stance, b in bodies]
         for sigma, iterations, kept in SEARCH:
             tried = [refine(self.quick, scan, self.prior, at, (sigma,), iterations) for at in tried]
-            tried = sorted(tried, key=lambda at: at.score)[:kept]
+            tried = self._different(sorted(tried, key=lambda at: at.score))[:kept]
         return tried
+
+    def _different(self, hypotheses: list[CoarsePose]) -> list[CoarsePose]:
+        """Those that no earlier one is the same as: starts that ran into one pose are worth one place."""
+        kept: list[CoarsePose] = []
+        joints: list[np.ndarray] = []
+        for at in hypotheses:
+            own = self.quick.forward(at).origin
+            if all(np.linalg.norm(own - other, axis=1).mean() > SAME_M for other in joints):
+                kept.append(at)
+                joints.append(own)
+        return kept
 
     def from_hull(
         self,
@@ -137,18 +150,17 @@ class PoseFinder:
     def reseed(self, scan: CoarseScan, at: CoarsePose) -> CoarsePose:
         """Try other configurations of arms and legs, one limb at a time; keep what scores best.
 
-        Once more where a part of the scan is still far from all of the body: a limb may have stood in
-        another's place.
+        Once more and more widely where a part of the scan is still far from all of the body: a limb may have
+        stood in another's place.
         """
-        for _ in range(2):
-            before = at.score
+        for sigmas_m in (COARSE_TO_FINE_M[2:], COARSE_TO_FINE_M[1:]):
             for limbs, seeds, refined in (
                 (ARMS, self.arm_seeds, REFINED_ARMS),
                 (LEGS, self.leg_seeds, REFINED_LEGS),
             ):
                 for limb, own_seeds in zip(limbs, seeds, strict=True):
-                    at = self._reseed_limb(scan, at, limb, own_seeds, refined)
-            if at.score == before or left_out(self.quick, scan, at) < LEFT_OUT:
+                    at = self._reseed_limb(scan, at, limb, own_seeds, refined, sigmas_m)
+            if left_out(self.quick, scan, at) < LEFT_OUT:
                 break
         return at
 
@@ -159,6 +171,7 @@ class PoseFinder:
         limb: tuple[int, ...],
         seeds: Float[np.ndarray, "s k 3"],
         refined: int,
+        sigmas_m: tuple[float, ...],
     ) -> CoarsePose:
         trials = []
         for seed in seeds:
@@ -168,7 +181,7 @@ class PoseFinder:
             trials.append(replace(trial, score=score(self.quick, scan, trial)))
         best = at
         for start in sorted(trials, key=lambda trial: trial.score)[:refined]:
-            trial = refine(self.quick, scan, self.prior, start, COARSE_TO_FINE_M[2:], iterations=4)
+            trial = refine(self.quick, scan, self.prior, start, sigmas_m, iterations=4)
             if trial.score < best.score:
                 best = trial
         return best

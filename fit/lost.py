@@ -1,8 +1,8 @@
 """Frames in which the body was lost are told by three signs, from numbers that the alignment has at hand.
 
-How far body and scan keep from each other (energy); how far a joint went since the neighbouring frame (speed);
-how much of the scan no part of the body explains, and how much of the body stands out of the scan (coverage).
-Each is measured against the sequence's own median, since clothes, cameras and frame rates differ: loose
+How far body and scan keep from each other (energy); how far a joint went since the neighbouring frame
+(speed); how much of the scan no part of the body explains, and how much of the body stands out of the scan
+(coverage). Each is measured against the sequence's own median, since clothes, cameras and frame rates differ: loose
 clothes and hulls of four cameras leave centimetres everywhere, and that is no sign of anything.
 """
 
@@ -42,9 +42,11 @@ SAME_POSE_M = 0.05
 
 @dataclass(frozen=True)
 class Signs:
-    """What tells whether a frame's body is in its place. distance_m: mean symmetric distance of the coarse body
-    and the scan; left_out: share of the scan far from the body; outside: share of the body out of the scan;
-    joints (J 3), m."""
+    """What tells whether a frame's body is in its place.
+
+    distance_m: mean symmetric distance of the coarse body and the scan; left_out: share of the scan far from
+    the body; outside: share of the body out of the scan; joints (J 3), m.
+    """
 
     distance_m: float
     left_out: float
@@ -137,23 +139,24 @@ def complaints(
         there = median if neighbour is None else max(median, getattr(neighbour, name))
         return bool(value > there + max(DEVIATIONS * deviation, floor))
 
+    usually = {name: getattr(usual, name)[0] for name in ("distance_m", "left_out", "outside")}
     if usual.n >= ENOUGH and odd("distance_m", DISTANCE_SHARE * usual.distance_m[0]):
         out.append(
-            f"the body keeps {1e3 * signs.distance_m:.0f} mm from the scan, {1e3 * usual.distance_m[0]:.0f} mm "
-            f"is usual"
+            f"the body keeps {1e3 * signs.distance_m:.0f} mm from the scan, "
+            f"{1e3 * usually['distance_m']:.0f} mm is usual"
         )
     if step is not None and is_fast(step, usual):
-        usually = f", {usual.step_m:.2f} m is usual" if usual.n_steps >= ENOUGH else ""
-        out.append(f"the {step.joint} moved {step.metres:.2f} m a frame since {step.since_id:06d}{usually}")
+        before = f", {usual.step_m:.2f} m is usual" if usual.n_steps >= ENOUGH else ""
+        out.append(f"the {step.joint} moved {step.metres:.2f} m a frame from {step.since_id:06d}{before}")
     if usual.n and odd("left_out", LEFT_OUT_SHARE):
         out.append(
-            f"{100 * signs.left_out:.1f} % of the scan is far from the body, {100 * usual.left_out[0]:.1f} % is "
-            f"usual: a limb may be left out"
+            f"{100 * signs.left_out:.1f} % of the scan is far from the body, "
+            f"{100 * usually['left_out']:.1f} % is usual: a limb may be left out"
         )
     if usual.n and odd("outside", OUTSIDE_SHARE):
         out.append(
-            f"{100 * signs.outside:.1f} % of the body stands out of the scan, {100 * usual.outside[0]:.1f} % "
-            f"is usual"
+            f"{100 * signs.outside:.1f} % of the body stands out of the scan, "
+            f"{100 * usually['outside']:.1f} % is usual"
         )
     return tuple(out)
 
