@@ -245,6 +245,7 @@ def _save_alignment(path: Path, alignment: Alignment, fingerprint: str) -> None:
         coarse_m=alignment.coarse_m,
         left_out=alignment.left_out,
         outside=alignment.outside,
+        tried=alignment.tried,
         lost=alignment.lost,
         fingerprint=fingerprint,
     )
@@ -265,6 +266,7 @@ def _load_alignment(path: Path, fingerprint: str) -> Alignment | None:
         float(found["coarse_m"]),
         float(found["left_out"]),
         float(found["outside"]),
+        bool(found["tried"]),
         bool(found["lost"]),
     )
 

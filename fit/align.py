@@ -37,7 +37,8 @@ class Alignment:
     state.template is the unposed clothed template; score: coarse distance of the starting pose, m;
     distance_m: mean distance of the scan to the alignment; status: "ok", "suspect" or "failed", with
     `message` saying why. coarse_m, left_out, outside: signs of a lost body (`lost.Signs`), of the aligned
-    pose; lost: other starts gave other poses and none of them was right, so that no neighbour starts here.
+    pose; tried: other starts were tried; lost: they gave other poses and none was right, so that no neighbour
+    starts here.
     """
 
     frame_id: int
@@ -49,6 +50,7 @@ class Alignment:
     coarse_m: float = np.inf
     left_out: float = 0.0
     outside: float = 0.0
+    tried: bool = False
     lost: bool = False
 
 

@@ -87,15 +87,17 @@ class AlignedFrames:
         for k in sorted(self.signs):
             before = self.found[k]
             step = self._isolated_step(k)
-            if not complaints(self.signs[k], step, usual) and not before.lost:
+            told = complaints(self.signs[k], step, usual)
+            if before.tried and not before.lost:
+                after = _told(before, told if len(told) > 1 or not is_fast(step, usual) else ())
+            elif told or before.lost:
+                coarse = self._coarse(k)
+                starts = [self._carried(k, other, coarse) for other in self._neighbours(k)]
+                after = self._best_of(k, coarse, starts, step, usual, lambda k=k: self._isolated_step(k))
+            else:
                 continue
-            coarse = self._coarse(k)
-            starts = [self._carried(k, other, coarse) for other in self._neighbours(k)]
-            after = self._best_of(k, coarse, starts, step, usual, lambda k=k: self._isolated_step(k))
-            if (after.status, after.message, after.lost) != (before.status, before.message, before.lost) or (
-                after.state is not before.state
-            ):
-                self.found[k] = after
+            self.found[k] = after
+            if (after.state is not before.state) or after.message != before.message:
                 self.report(after)
 
     def _aligned(self, k: int, previous: int | None, hypotheses: tuple[CoarsePose, ...]) -> Alignment:
@@ -174,7 +176,7 @@ class AlignedFrames:
         agreed = alone is not None and same_pose(alone.joints, kept_signs.joints)
         if agreed and len(left) == 1 and is_fast(kept_step, usual):
             left = ()
-        return _told(replace(kept, lost=bool(left) and not agreed), left)
+        return _told(replace(kept, tried=True, lost=bool(left) and not agreed), left)
 
     # What is known of the frames
 
@@ -235,6 +237,8 @@ def _is_there(one: Alignment) -> bool:
 
 def _is_better(signs: Signs, step: Step | None, than: Signs, than_step: Step | None) -> bool:
     """Whether the first of two poses of a frame is to be taken."""
+    if same_pose(signs.joints, than.joints) and signs.distance_m * AS_GOOD > than.distance_m:
+        return False
     if max(signs.distance_m, than.distance_m) > AS_GOOD * min(signs.distance_m, than.distance_m):
         return signs.distance_m < than.distance_m
     if step is None or than_step is None:

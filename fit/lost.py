@@ -2,8 +2,8 @@
 
 How far body and scan keep from each other (energy); how far a joint went since the neighbouring frame
 (speed); how much of the scan no part of the body explains, and how much of the body stands out of the scan
-(coverage). Each is measured against the sequence's own median, since clothes, cameras and frame rates differ: loose
-clothes and hulls of four cameras leave centimetres everywhere, and that is no sign of anything.
+(coverage). Each is measured against the sequence's own median, since clothes, cameras and frame rates differ:
+loose clothes and hulls of four cameras leave centimetres everywhere, and that is no sign of anything.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from fit.body.skeleton import JOINT_NAMES
-from fit.coarse import CoarseBody, CoarsePose, CoarseScan, left_out, score
+from fit.coarse import LEFT_OUT_M, CoarseBody, CoarsePose, CoarseScan, left_out, score
 
 #: From so many frames on a median says what is usual.
 ENOUGH = 4
 #: Beyond the median by so many robust deviations is out of line; one frame in thousands would be by chance.
 DEVIATIONS = 5.0
 #: But never less than this share of the median distance: poses of one person differ by that in themselves.
-DISTANCE_SHARE = 0.20
+DISTANCE_SHARE = 0.12
 #: An arm from the elbow down is 4 % of a body's surface; half of that hidden is still worth a second try.
 LEFT_OUT_SHARE = 0.02
 #: A limb that ends in the air is as large; hands and feet alone, which hulls often lack, are 2 % each.
-OUTSIDE_SHARE = 0.03
+OUTSIDE_SHARE = 0.025
 #: Body vertices farther out of the scan than this are no bad silhouette.
 OUTSIDE_M = 0.06
 #: A joint that goes so many times as far as is usual; people start and stop within a few frames.
@@ -45,7 +45,7 @@ class Signs:
     """What tells whether a frame's body is in its place.
 
     distance_m: mean symmetric distance of the coarse body and the scan; left_out: share of the scan far from
-    the body; outside: share of the body out of the scan; joints (J 3), m.
+    the body; outside: share of the body out of the scan, or where there is none near; joints (J 3), m.
     """
 
     distance_m: float
@@ -58,11 +58,11 @@ class Signs:
         """Read a pose that was aligned to this scan."""
         posed = body.forward(at)
         points = posed.points[: body.n_surface]
-        nearest = cKDTree(scan.points).query(points)[1]
+        away, nearest = cKDTree(scan.points).query(points)
         out = ((points - scan.points[nearest]) * scan.normals[nearest]).sum(1)
-        return Signs(
-            score(body, scan, at), left_out(body, scan, at), float((out > OUTSIDE_M).mean()), posed.origin
-        )
+        # Past the end of an open tube (a sleeve without its hand) the nearest normals point aside.
+        outside = (out > OUTSIDE_M) | ((away > LEFT_OUT_M) & (out > -OUTSIDE_M))
+        return Signs(score(body, scan, at), left_out(body, scan, at), float(outside.mean()), posed.origin)
 
 
 @dataclass(frozen=True)

