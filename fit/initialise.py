@@ -1,8 +1,8 @@
 """The first pose, found with no help: from the hull alone, or from triangulated keypoints.
 
-Starting poses face eight directions; the best are kept, refined, and their arms tried anew in other
-configurations, since a lost arm (folded onto the trunk) is nearly the only way to fail. The paper used
-landmarks for this (section 5.1).
+Starting poses stand or sit and face eight directions; the best that differ are kept, refined, and their arms and
+legs tried anew in other configurations, since a lost limb (folded onto the trunk) is nearly the only way to
+fail. The paper used landmarks for this (section 5.1).
 """
 
 from __future__ import annotations

@@ -107,6 +107,7 @@ def test_a_frame_that_started_wrong_is_started_anew(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(aligned_frames, "starting_poses", misled)
     done = align_sequence(fitter(), finder(), frames(), SETTINGS)
     assert [a.status for a in done] == ["ok"] * N_FRAMES, [a.message for a in done]
+    assert [a.tried for a in done] == [False] * 5 + [True]
     off = joints_off(done[5], 5)
     assert off.max() < 0.06, f"the worst joint is {1e3 * off.max():.0f} mm off"
 
