@@ -145,7 +145,7 @@ def found(
     """The start, the pose after alignment, and CPU seconds of both."""
     settings = FitSettings()
     begin = time.process_time()
-    coarse = CoarseScan.of(truth.scan.points, truth.scan.normals)
+    coarse = CoarseScan.of(truth.scan.points, truth.scan.normals, weight=truth.scan.weight)
     keypoints = truth.keypoints if helped else None
     starts = starting_poses(finder, coarse, keypoints, None, np.zeros(3), np.inf)
     middle = time.process_time()

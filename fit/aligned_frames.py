@@ -182,7 +182,7 @@ class AlignedFrames:
 
     def _coarse(self, k: int) -> CoarseScan:
         scan = self.frames[k][1]
-        return CoarseScan.of(scan.points, scan.normals)
+        return CoarseScan.of(scan.points, scan.normals, weight=scan.weight)
 
     def _pose(self, k: int) -> CoarsePose:
         one = self.found[k]

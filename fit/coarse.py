@@ -22,6 +22,9 @@ from fit.surface import vertex_areas, vertex_normals
 NORMAL_WEIGHT_M = 0.08
 #: The score's cut-off: a point farther than this says nothing about how far.
 SCORE_CUT_M = 0.10
+#: Deviations of a scan's weights (1 on average) between which it becomes doubtful: hulls of 16 cameras have
+#: 0 to 0.04, one of four has 0.45.
+DOUBTFUL_SPREAD = (0.1, 0.4)
 #: Farther from the body than clothes are, and than the vertices of the coarse body are from each other.
 LEFT_OUT_M = 0.12
 #: Share of the point-to-point part beside the point-to-plane part, for pairs found from the body and from the
@@ -44,11 +47,13 @@ class CoarsePose:
 
 @dataclass(frozen=True)
 class CoarseScan:
-    """Points, outward normals, and the search tree over (point, weighted normal)."""
+    """Points, outward normals, and the search tree over (point, weighted normal); doubt: how much of the
+    scan may be space that no camera saw to be empty, 0 (none) to 1."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
     tree: cKDTree
+    doubt: float = 0.0
 
     @property
     def stride(self) -> int:
@@ -56,12 +61,19 @@ class CoarseScan:
         return max(1, len(self.points) // 800)
 
     @staticmethod
-    def of(points: np.ndarray, normals: np.ndarray, n_points: int = 4000) -> CoarseScan:
+    def of(
+        points: np.ndarray, normals: np.ndarray, n_points: int = 4000, weight: np.ndarray | None = None
+    ) -> CoarseScan:
         """An even subset of an area-uniform scan: dense, so that a body point finds a scan point straight
-        ahead of it."""
+        ahead of it.
+
+        weight: of the points (`Scan.weight`), uneven where a hull of few cameras is loose.
+        """
         keep = np.linspace(0, len(points) - 1, min(n_points, len(points))).astype(int)
         points, normals = points[keep], normals[keep]
-        return CoarseScan(points, normals, cKDTree(np.hstack([points, NORMAL_WEIGHT_M * normals])))
+        low, high = DOUBTFUL_SPREAD
+        doubt = 0.0 if weight is None else float(np.clip((weight.std() - low) / (high - low), 0.0, 1.0))
+        return CoarseScan(points, normals, cKDTree(np.hstack([points, NORMAL_WEIGHT_M * normals])), doubt)
 
 
 @dataclass(frozen=True)
@@ -234,7 +246,8 @@ class CoarsePrior:
 
     pose_weight holds at sigma_m and above. Below, the weight falls with the square of sigma, as that of
     residuals of this size would: what is near the scan already must not be pulled off it because few people
-    hold their hands on their heads.
+    hold their hands on their heads. But not in a doubtful scan: hulls of four cameras have space around the
+    person that limbs would wander off into.
     """
 
     mean: Float[np.ndarray, "m"]
@@ -243,9 +256,9 @@ class CoarsePrior:
     sigma_m: float = 0.15
     betas_weight: float = 0.01
 
-    def weight_at(self, sigma_m: float) -> float:
-        """Weight of the pose beside pairs of this scale."""
-        return self.pose_weight * min(1.0, (sigma_m / self.sigma_m) ** 2)
+    def weight_at(self, sigma_m: float, doubt: float = 0.0) -> float:
+        """Weight of the pose beside pairs of this scale; doubt: of the scan, 0 to 1."""
+        return self.pose_weight * max(doubt, min(1.0, (sigma_m / self.sigma_m) ** 2))
 
 
 def score(body: CoarseBody, scan: CoarseScan, at: CoarsePose) -> float:
@@ -283,7 +296,7 @@ def refine(
     size = 3 * n_joints + 3 + body.n_betas
     jacobian: np.ndarray | None = None
     for sigma in sigmas_m:
-        pose_weight = prior.weight_at(sigma)
+        pose_weight = prior.weight_at(sigma, 0.0 if scan is None else scan.doubt)
         for _ in range(iterations):
             posed = body.forward(at)
             jacobian = body.jacobian_in_world(posed, jacobian)

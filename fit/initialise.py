@@ -1,8 +1,8 @@
 """The first pose, found with no help: from the hull alone, or from triangulated keypoints.
 
-Starting poses stand or sit and face eight directions; the best that differ are kept, refined, and their arms and
-legs tried anew in other configurations, since a lost limb (folded onto the trunk) is nearly the only way to
-fail. The paper used landmarks for this (section 5.1).
+Starting poses stand or sit and face eight directions; the best that differ are kept, refined, and their arms
+and legs tried anew in other configurations, since a lost limb (folded onto the trunk) is nearly the only way
+to fail. The paper used landmarks for this (section 5.1).
 """
 
 from __future__ import annotations
@@ -37,8 +37,6 @@ LEFT_OUT = 0.01
 COARSE_TO_FINE_M = (0.3, 0.15, 0.08, 0.05)
 #: Facing ways this far apart, rad, are different hypotheses.
 OTHER_HEADING = 1.0
-#: A score this much worse than the best frame's means that the previous pose did not carry over.
-LOST = 1.10
 
 
 @dataclass(frozen=True)

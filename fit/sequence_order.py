@@ -63,7 +63,7 @@ def surest_frame(finder: PoseFinder, frames: Sequence[tuple[int, Scan, Keypoints
     best, least = FirstFrame(chosen[0]), np.inf
     for k in chosen:
         _, scan, keypoints = frames[k]
-        coarse = CoarseScan.of(scan.points, scan.normals)
+        coarse = CoarseScan.of(scan.points, scan.normals, weight=scan.weight)
         found = None if keypoints is None else finder.from_keypoints(coarse, keypoints)
         hypotheses = [found] if found is not None else finder.search(coarse)
         doubtful = doubt(hypotheses)

@@ -124,6 +124,14 @@ def test_the_prior_gives_way_as_the_pose_gets_near():
     prior = finder().prior
     assert prior.weight_at(0.3) == prior.weight_at(0.15) == prior.pose_weight
     assert prior.weight_at(0.05) == pytest.approx(prior.pose_weight / 9)
+    assert prior.weight_at(0.05, doubt=1.0) == prior.pose_weight
+
+
+def test_a_loose_hull_is_doubtful():
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    even, uneven = np.ones(50), np.where(np.arange(50) % 2, 1.5, 0.5)
+    assert CoarseScan.of(points, points, weight=even).doubt == CoarseScan.of(points, points).doubt == 0.0
+    assert CoarseScan.of(points, points, weight=uneven).doubt == 1.0
 
 
 def test_keypoints_with_gaps_give_the_pose():
