@@ -47,7 +47,7 @@ class Fit:
     body: str | None = None
     """Body model, if another than the run was made with: free:neutral, free:female, free:male, or a path."""
     keypoints: Path | None = None
-    """Folder of OpenPose BODY_25 files, <camera>/<frame>.json, to start the pose from."""
+    """Folder of keypoints, OpenPose's or COCO's, to start the pose from."""
     overwrite: bool = False
     """Replace the fit that the folder holds."""
     pose_prior: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None

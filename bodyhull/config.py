@@ -55,7 +55,8 @@ class RunConfig:
     background: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Folder of background plates, <camera>.png, for recordings of videos."""
     keypoints: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Folder of OpenPose BODY_25 files, <camera>/<frame>.json, to start the pose from. Never needed."""
+    """Folder of keypoints to start the pose from, OpenPose's or COCO's: <camera>/<frame>.json, or COCO's
+    <camera>.json. Never needed."""
     overwrite: bool = False
     """Redo what this run folder already holds."""
     pose_prior: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None

@@ -219,7 +219,8 @@ def _align(
 
         def keep(alignment: Alignment) -> None:
             _save_alignment(folder.alignment(alignment.frame_id), alignment, prints[alignment.frame_id])
-            bar.update()
+            if bar.n < len(scans):  # a second look tells of some frames again
+                bar.update()
 
         frames = [(k, scan, keypoints.get(k)) for k, scan in scans.items()]
         return align_sequence(fitter, finder, frames, settings, keep, done)
@@ -243,13 +244,18 @@ def _save_alignment(path: Path, alignment: Alignment, fingerprint: str) -> None:
         distance_m=alignment.distance_m,
         status=alignment.status,
         message=alignment.message,
+        coarse_m=alignment.coarse_m,
+        left_out=alignment.left_out,
+        outside=alignment.outside,
+        tried=alignment.tried,
+        lost=alignment.lost,
         fingerprint=fingerprint,
     )
 
 
 def _load_alignment(path: Path, fingerprint: str) -> Alignment | None:
     found = load_arrays(path)
-    if found is None or str(found.get("fingerprint")) != fingerprint:
+    if found is None or str(found.get("fingerprint")) != fingerprint or "lost" not in found:
         return None
     state = BodyState(found["template"], found["pose"], found["translation"], found["betas"])
     return Alignment(
@@ -259,6 +265,11 @@ def _load_alignment(path: Path, fingerprint: str) -> Alignment | None:
         float(found["distance_m"]),
         str(found["status"]),
         str(found["message"]),
+        float(found["coarse_m"]),
+        float(found["left_out"]),
+        float(found["outside"]),
+        bool(found["tried"]),
+        bool(found["lost"]),
     )
 
 

@@ -1,4 +1,4 @@
-"""OpenPose BODY_25 detections in several cameras -> one person's joints in the world.
+"""Keypoints detected in several cameras (BODY_25's points) -> one person's joints in the world.
 
 Several people and wrong detections are usual: the person is chosen per camera by the silhouette and by
 agreement between cameras, and every joint is triangulated by LO-RANSAC (pycolmap), so that one wrong view
@@ -16,7 +16,8 @@ import pycolmap
 from jaxtyping import Float, UInt8
 
 from capture.camera import Camera
-from capture.formats.openpose import N_JOINTS, read_keypoints
+from capture.formats.openpose import N_JOINTS
+from capture.keypoint_files import read_keypoints
 from capture.rig import Rig
 from capture.silhouette_files import PERSON
 

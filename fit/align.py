@@ -2,19 +2,21 @@
 skin.
 
 The pose is found first (initialise.py), then pose and shape alone are fitted, then the template joins them.
-What is left in the unposed templates is cloth, with the motion factored out.
+What is left in the unposed templates is cloth, with the motion factored out. Frames are aligned from the
+surest one both ways in time (sequence_order.py), each from its neighbour; a frame in which the body was lost
+(lost.py) is started anew.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from fit.coarse import CoarsePose, CoarseScan
-from fit.initialise import LOST, PoseFinder, unwrap_root
+from fit.initialise import PoseFinder, unwrap_root
 from fit.settings import FitSettings
 from fit.solver import Fitter, Objective, ScanPoints, Unknowns, minimise
 from fit.state import BodyState
@@ -22,6 +24,8 @@ from hull.scan import Scan
 
 #: So many points tell the pose; the template then takes all of them.
 POSE_POINTS = 12_000
+#: A score this much worse than the best frame's means that the previous pose did not carry over.
+LOST = 1.10
 #: Alignments whose points stay this far away on average are marked: the pose is probably wrong.
 SUSPICIOUS_M = 0.03
 
@@ -32,7 +36,9 @@ class Alignment:
 
     state.template is the unposed clothed template; score: coarse distance of the starting pose, m;
     distance_m: mean distance of the scan to the alignment; status: "ok", "suspect" or "failed", with
-    `message` saying why.
+    `message` saying why. coarse_m, left_out, outside: signs of a lost body (`lost.Signs`), of the aligned
+    pose; tried: other starts were tried; lost: they gave other poses and none was right, so that no neighbour
+    starts here.
     """
 
     frame_id: int
@@ -41,6 +47,11 @@ class Alignment:
     distance_m: float
     status: str = "ok"
     message: str = ""
+    coarse_m: float = np.inf
+    left_out: float = 0.0
+    outside: float = 0.0
+    tried: bool = False
+    lost: bool = False
 
 
 def as_scan_points(scan: Scan) -> ScanPoints:
@@ -100,79 +111,26 @@ def align_sequence(
     report: Callable[[Alignment], None] = lambda alignment: None,
     done_before: Mapping[int, Alignment] | None = None,
 ) -> list[Alignment]:
-    """Align the frames in order: (frame_id, scan in the body's frame or None, keypoints or None).
+    """Align frames that follow each other in time: (frame_id, scan in the body's frame or None, keypoints or
+    None). The results are in the same order.
 
-    Each frame starts from the previous pose; where that scores clearly worse than the best frame so far, or
-    there is none, the pose is found anew. A frame without a scan is passed over; one that raises is kept,
-    marked "failed". Frames of `done_before` are taken as they are; `report` hears of the others.
+    The surest frame comes first; the others start from the pose of the frame beside them, later ones first,
+    then earlier ones. Where that scores clearly worse than the best frame so far, or there is none, the pose
+    is found anew; so it is where the body was lost, and once more when all frames are there. A frame without
+    a scan is passed over; one that raises is kept, marked "failed". Frames of `done_before` are taken as
+    they are; `report` hears of the others, and again of one that a second look changed.
     """
     from threadpoolctl import threadpool_limits
 
+    from fit.aligned_frames import AlignedFrames
+
+    frames = [(frame_id, scan, keypoints) for frame_id, scan, keypoints in scans if scan is not None]
     # The matrices of pose finding are small: threads would only fight over them.
     with threadpool_limits(limits=1, user_api="blas"):
-        return _align_in_order(fitter, finder, scans, settings, report, done_before or {})
-
-
-def _align_in_order(
-    fitter: Fitter,
-    finder: PoseFinder,
-    scans: Iterable[tuple[int, Scan | None, Float[np.ndarray, "25 4"] | None]],
-    settings: FitSettings,
-    report: Callable[[Alignment], None],
-    done_before: Mapping[int, Alignment],
-) -> list[Alignment]:
-    done: list[Alignment] = []
-    previous: CoarsePose | None = None
-    centroid = np.zeros(3)
-    best_score = np.inf
-    for frame_id, scan, keypoints in scans:
-        if scan is None:
-            continue
-        if frame_id in done_before:
-            alignment = done_before[frame_id]
-            done.append(alignment)
-            if alignment.status == "failed":
-                previous = None
-            else:
-                state = alignment.state
-                previous = CoarsePose(state.pose, state.translation, state.betas, alignment.score)
-                best_score, centroid = min(best_score, alignment.score), scan.points.mean(0)
-            continue
-        try:
-            if not (np.isfinite(scan.points).all() and np.isfinite(scan.normals).all()):
-                raise FloatingPointError("the scan holds NaN or infinite coordinates")
-            coarse = CoarseScan.of(scan.points, scan.normals)
-            starts = starting_poses(finder, coarse, keypoints, previous, centroid, best_score)
-            state = align_frame(fitter, finder, as_scan_points(scan), starts, settings)
-            posed = fitter.posed(state)
-            distance = mean_distance(fitter, posed, scan.points)
-        except (FloatingPointError, np.linalg.LinAlgError) as error:
-            rest = BodyState(
-                fitter.shaped(np.zeros(finder.n_model_betas)),
-                finder.mean_pose(),
-                np.zeros(3),
-                np.zeros(finder.n_model_betas),
-            )
-            alignment = Alignment(frame_id, rest, np.inf, np.inf, "failed", f"frame {frame_id:06d}: {error}")
-            done.append(alignment)
-            report(alignment)
-            previous = None
-            continue
-        score = starts[0].score
-        alignment = Alignment(frame_id, state, score, distance)
-        if distance > SUSPICIOUS_M:
-            alignment = replace(
-                alignment,
-                status="suspect",
-                message=f"frame {frame_id:06d}: the alignment stays {1e3 * distance:.0f} mm from the scan "
-                "on average",
-            )
-        best_score = min(best_score, score)
-        previous = CoarsePose(state.pose, state.translation, state.betas, score)
-        centroid = scan.points.mean(0)
-        done.append(alignment)
-        report(alignment)
-    return done
+        walk = AlignedFrames(fitter, finder, frames, settings, report, done_before or {})
+        walk.align_all()
+        walk.look_again()
+    return walk.in_order()
 
 
 def starting_poses(
@@ -182,9 +140,10 @@ def starting_poses(
     previous: CoarsePose | None,
     previous_centroid: Float[np.ndarray, "3"],
     best_score: float,
+    hypotheses: Sequence[CoarsePose] = (),
 ) -> list[CoarsePose]:
     """Where to start a frame: keypoints where given, else the previous pose, else (or when lost) the hull
-    alone."""
+    alone (from `hypotheses` of `PoseFinder.search`, where it was searched already)."""
     starts: list[CoarsePose] = []
     betas = None if previous is None else previous.betas
     if keypoints is not None:
@@ -194,9 +153,16 @@ def starting_poses(
     if previous is not None:
         starts.append(finder.from_previous(coarse, previous, previous_centroid))
     if not starts or min(at.score for at in starts) > LOST * best_score:
-        starts += finder.from_hull(coarse, betas)[:2]
+        starts += finder.from_hull(coarse, betas, hypotheses)[:2]
     starts = sorted(starts, key=lambda at: at.score)
     return [at for at in starts if at.score < 1.25 * starts[0].score][:2]
+
+
+def distance_complaint(distance_m: float) -> tuple[str, ...]:
+    """What there is to say of an alignment that keeps this mean distance: nothing, or a clause."""
+    if distance_m <= SUSPICIOUS_M:
+        return ()
+    return (f"the alignment stays {1e3 * distance_m:.0f} mm from the scan on average",)
 
 
 def mean_distance(fitter: Fitter, posed: np.ndarray, points: np.ndarray) -> float:

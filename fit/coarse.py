@@ -22,6 +22,11 @@ from fit.surface import vertex_areas, vertex_normals
 NORMAL_WEIGHT_M = 0.08
 #: The score's cut-off: a point farther than this says nothing about how far.
 SCORE_CUT_M = 0.10
+#: Deviations of a scan's weights (1 on average) between which it becomes doubtful: hulls of 16 cameras have
+#: 0 to 0.04, one of four has 0.45.
+DOUBTFUL_SPREAD = (0.1, 0.4)
+#: Farther from the body than clothes are, and than the vertices of the coarse body are from each other.
+LEFT_OUT_M = 0.12
 #: Share of the point-to-point part beside the point-to-plane part, for pairs found from the body and from the
 #: scan.
 BODY_GLUE, SCAN_GLUE = 0.05, 0.4
@@ -42,11 +47,13 @@ class CoarsePose:
 
 @dataclass(frozen=True)
 class CoarseScan:
-    """Points, outward normals, and the search tree over (point, weighted normal)."""
+    """Points, outward normals, and the search tree over (point, weighted normal); doubt: how much of the
+    scan may be space that no camera saw to be empty, 0 (none) to 1."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
     tree: cKDTree
+    doubt: float = 0.0
 
     @property
     def stride(self) -> int:
@@ -54,12 +61,19 @@ class CoarseScan:
         return max(1, len(self.points) // 800)
 
     @staticmethod
-    def of(points: np.ndarray, normals: np.ndarray, n_points: int = 4000) -> CoarseScan:
+    def of(
+        points: np.ndarray, normals: np.ndarray, n_points: int = 4000, weight: np.ndarray | None = None
+    ) -> CoarseScan:
         """An even subset of an area-uniform scan: dense, so that a body point finds a scan point straight
-        ahead of it."""
+        ahead of it.
+
+        weight: of the points (`Scan.weight`), uneven where a hull of few cameras is loose.
+        """
         keep = np.linspace(0, len(points) - 1, min(n_points, len(points))).astype(int)
         points, normals = points[keep], normals[keep]
-        return CoarseScan(points, normals, cKDTree(np.hstack([points, NORMAL_WEIGHT_M * normals])))
+        low, high = DOUBTFUL_SPREAD
+        doubt = 0.0 if weight is None else float(np.clip((weight.std() - low) / (high - low), 0.0, 1.0))
+        return CoarseScan(points, normals, cKDTree(np.hstack([points, NORMAL_WEIGHT_M * normals])), doubt)
 
 
 @dataclass(frozen=True)
@@ -144,16 +158,38 @@ class CoarseBody:
 
     def jacobian(self, posed: _Posed) -> Float[np.ndarray, "n 3 p"]:
         """dv / d(rotation vectors in the parents' frames (3 J), translation (3), betas)."""
+        return self.jacobian_in_world(posed) @ self.world_turns(posed)
+
+    def world_turns(self, posed: _Posed) -> Float[np.ndarray, "p p"]:
+        """Columns of `jacobian_in_world` from the parameters: a rotation vector in its parent's frame turned
+        into the world's."""
+        n_joints = len(self.parents)
+        frames = np.stack([np.eye(3) if p < 0 else posed.world[p] for p in self.parents])
+        turns = np.zeros((3, n_joints, n_joints, 3))
+        each = np.arange(n_joints)
+        turns[:, each, each] = frames.transpose(1, 0, 2)
+        out = np.eye(3 * n_joints + 3 + self.n_betas)
+        out[: 3 * n_joints, : 3 * n_joints] = turns.reshape(3 * n_joints, 3 * n_joints)
+        return out
+
+    def jacobian_in_world(
+        self, posed: _Posed, out: Float[np.ndarray, "n 3 p"] | None = None
+    ) -> Float[np.ndarray, "n 3 p"]:
+        """The same with rotations about the world's axes (all joints about x, then y, then z): a cross
+        product is then a copy of numbers, and turning the small normal equations costs nothing.
+
+        out: what an earlier call returned, to be filled anew (fresh memory costs as much as the numbers).
+        """
         n, n_joints = len(self.rest), len(self.parents)
         moment = np.matmul(self.descends, posed.by_bone)
         share = self.weights @ self.descends.T
         arm = moment - share[:, :, None] * posed.origin
-        parent_frame = np.stack([np.eye(3) if p < 0 else posed.world[p] for p in self.parents])
-        out = np.empty((n, 3, 3 * n_joints + 3 + self.n_betas))
-        axes = parent_frame.transpose(0, 2, 1)  # (J, which axis, xyz)
-        out[:, :, : 3 * n_joints] = (
-            np.cross(axes[None], arm[:, :, None, :]).transpose(0, 3, 1, 2).reshape(n, 3, -1)
-        )
+        out = np.zeros((n, 3, 3 * n_joints + 3 + self.n_betas)) if out is None else out
+        for axis in range(3):
+            after, last = (axis + 1) % 3, (axis + 2) % 3
+            turns = slice(axis * n_joints, (axis + 1) * n_joints)
+            out[:, last, turns] = arm[:, :, after]
+            out[:, after, turns] = -arm[:, :, last]
         out[:, :, 3 * n_joints : 3 * n_joints + 3] = np.eye(3)
         # Betas move the vertex in its bones' frames, and the joints under it.
         shape = np.einsum("nab,nbk->nak", posed.blended, self.shape)
@@ -206,12 +242,23 @@ def left_jacobian_inverse(rotation_vector: Float[np.ndarray, "m 3"]) -> Float[np
 
 @dataclass(frozen=True)
 class CoarsePrior:
-    """Gaussian over all joints but the root: mean (3 (J-1)), precision; weights of pose and betas."""
+    """Gaussian over all joints but the root: mean (3 (J-1)), precision; weights of pose and betas.
+
+    pose_weight holds at sigma_m and above. Below, the weight falls with the square of sigma, as that of
+    residuals of this size would: what is near the scan already must not be pulled off it because few people
+    hold their hands on their heads. But not in a doubtful scan: hulls of four cameras have space around the
+    person that limbs would wander off into.
+    """
 
     mean: Float[np.ndarray, "m"]
     precision: Float[np.ndarray, "m m"]
     pose_weight: float = 0.004
+    sigma_m: float = 0.15
     betas_weight: float = 0.01
+
+    def weight_at(self, sigma_m: float, doubt: float = 0.0) -> float:
+        """Weight of the pose beside pairs of this scale; doubt: of the scan, 0 to 1."""
+        return self.pose_weight * max(doubt, min(1.0, (sigma_m / self.sigma_m) ** 2))
 
 
 def score(body: CoarseBody, scan: CoarseScan, at: CoarsePose) -> float:
@@ -221,6 +268,13 @@ def score(body: CoarseBody, scan: CoarseScan, at: CoarsePose) -> float:
     to_scan = scan.tree.query(own)[0]
     to_body = cKDTree(own).query(scan.tree.data[:: scan.stride])[0]
     return float(0.5 * (np.minimum(to_scan, SCORE_CUT_M).mean() + np.minimum(to_body, SCORE_CUT_M).mean()))
+
+
+def left_out(body: CoarseBody, scan: CoarseScan, at: CoarsePose) -> float:
+    """Share of the scan's points that are farther than LEFT_OUT_M from every vertex of the body."""
+    points = body.forward(at).points[: body.n_surface]
+    asked = scan.points[:: scan.stride]
+    return float((cKDTree(points).query(asked, distance_upper_bound=LEFT_OUT_M)[0] == np.inf).mean())
 
 
 def refine(
@@ -240,10 +294,12 @@ def refine(
     at = start
     n, n_joints = body.n_surface, len(body.parents)
     size = 3 * n_joints + 3 + body.n_betas
+    jacobian: np.ndarray | None = None
     for sigma in sigmas_m:
+        pose_weight = prior.weight_at(sigma, 0.0 if scan is None else scan.doubt)
         for _ in range(iterations):
             posed = body.forward(at)
-            jacobian = body.jacobian(posed)
+            jacobian = body.jacobian_in_world(posed, jacobian)
             hessian, rhs = np.zeros((size, size)), np.zeros(size)
             if scan is not None:
                 own = np.hstack([posed.points[:n], NORMAL_WEIGHT_M * posed.normals[:n]])
@@ -278,12 +334,15 @@ def refine(
                 flat = jacobian[n:].reshape(-1, size)
                 hessian += flat.T @ (np.repeat(weight, 3)[:, None] * flat)
                 rhs += flat.T @ (np.repeat(weight, 3) * gap.ravel())
+            turns_in_world = body.world_turns(posed)
+            hessian = turns_in_world.T @ hessian @ turns_in_world
+            rhs = turns_in_world.T @ rhs
             inner = slice(3, 3 * n_joints)
             turn = np.zeros((3 * n_joints - 3, 3 * n_joints - 3))
             for j, block in enumerate(left_jacobian_inverse(at.pose[1:])):
                 turn[3 * j : 3 * j + 3, 3 * j : 3 * j + 3] = block
-            hessian[inner, inner] += prior.pose_weight * turn.T @ prior.precision @ turn
-            rhs[inner] -= prior.pose_weight * turn.T @ (prior.precision @ (at.pose[1:].ravel() - prior.mean))
+            hessian[inner, inner] += pose_weight * turn.T @ prior.precision @ turn
+            rhs[inner] -= pose_weight * turn.T @ (prior.precision @ (at.pose[1:].ravel() - prior.mean))
             betas = slice(3 * n_joints + 3, size)
             hessian[betas, betas] += prior.betas_weight * np.eye(body.n_betas)
             rhs[betas] -= prior.betas_weight * at.betas[: body.n_betas]

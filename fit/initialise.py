@@ -1,13 +1,14 @@
 """The first pose, found with no help: from the hull alone, or from triangulated keypoints.
 
-Starting poses face eight directions; the best are kept, refined, and their arms tried anew in other
-configurations, since a lost arm (folded onto the trunk) is nearly the only way to fail. The paper used
-landmarks for this (section 5.1).
+Starting poses stand or sit and face eight directions; the best that differ are kept, refined, and their arms
+and legs tried anew in other configurations, since a lost limb (folded onto the trunk) is nearly the only way
+to fail. The paper used landmarks for this (section 5.1).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,22 +16,27 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from fit.body.model import BodyModel
-from fit.coarse import CoarseBody, CoarsePose, CoarsePrior, CoarseScan, Targets, refine, score
+from fit.coarse import CoarseBody, CoarsePose, CoarsePrior, CoarseScan, Targets, left_out, refine, score
+from fit.limb_seeds import ARMS, LEGS, arm_configurations, leg_configurations, stances
 
 if TYPE_CHECKING:
     from fit.body.pose_prior import PosePrior
 
 N_HEADINGS = 8
 KEPT = 3
-#: Arm configurations refined a side, out of all that arm_configurations() lists.
-REFINED_ARMS = 6
-#: SMPL joint numbers from collar to wrist.
-ARMS = ((13, 16, 18, 20), (14, 17, 19, 21))
+#: The search among many starts is done with so many vertices, the rest with all of the coarse body's.
+QUICK_VERTICES = 350
+#: (sigma m, iterations, how many of the best go on) of the search.
+SEARCH = ((0.3, 6, 8), (0.15, 6, 4), (0.08, 6, 4), (0.05, 6, 4))
+#: Configurations refined a limb, out of all that limb_seeds.py lists.
+REFINED_ARMS, REFINED_LEGS = 6, 4
+#: Hypotheses whose joints are this near on average are one.
+SAME_M = 0.03
+#: A larger share of the scan far from the body means that a limb is not where it should be.
+LEFT_OUT = 0.01
 COARSE_TO_FINE_M = (0.3, 0.15, 0.08, 0.05)
 #: Facing ways this far apart, rad, are different hypotheses.
 OTHER_HEADING = 1.0
-#: A score this much worse than the best frame's means that the previous pose did not carry over.
-LOST = 1.10
 
 
 @dataclass(frozen=True)
@@ -39,7 +45,9 @@ class PoseFinder:
 
     body: CoarseBody
     prior: CoarsePrior
+    quick: CoarseBody
     arm_seeds: Float[np.ndarray, "2 s 4 3"]
+    leg_seeds: Float[np.ndarray, "2 l 3 3"]
     n_model_betas: int
 
     @staticmethod
@@ -48,7 +56,9 @@ class PoseFinder:
         return PoseFinder(
             CoarseBody.of(model),
             CoarsePrior(prior.mean, np.linalg.inv(prior.covariance)),
+            CoarseBody.of(model, QUICK_VERTICES),
             arm_configurations(),
+            leg_configurations(),
             model.shape_directions.shape[2],
         )
 
@@ -56,9 +66,15 @@ class PoseFinder:
         """The prior's mean with an upright root."""
         return np.vstack([np.zeros(3), self.prior.mean.reshape(-1, 3)])
 
-    def facing(self, scan: CoarseScan, heading_rad: float, betas: np.ndarray) -> CoarsePose:
-        """The mean pose turned about the vertical, its centre on the scan's."""
-        pose = self.mean_pose()
+    def facing(
+        self,
+        scan: CoarseScan,
+        heading_rad: float,
+        betas: np.ndarray,
+        stance: Float[np.ndarray, "j 3"] | None = None,
+    ) -> CoarsePose:
+        """A stance (the mean pose unless given) turned about the vertical, its centre on the scan's."""
+        pose = self.mean_pose() if stance is None else stance.copy()
         pose[0] = [0.0, heading_rad, 0.0]
         at = CoarsePose(pose, np.zeros(3), betas)
         points = self.body.forward(at).points[: self.body.n_surface]
@@ -86,44 +102,87 @@ class PoseFinder:
         betas[0] = np.clip((wanted - height(0.0)) / slope, -3.0, 3.0) if abs(slope) > 1e-3 else 0.0
         return betas
 
-    def from_hull(self, scan: CoarseScan, betas: np.ndarray | None = None) -> list[CoarsePose]:
-        """Hypotheses from the hull alone, best first. betas: of the same person in another frame, if
-        known."""
-        starts = [np.zeros(self.n_model_betas), self.standing_betas(scan)] if betas is None else [betas]
+    def search(self, scan: CoarseScan, betas: np.ndarray | None = None) -> list[CoarsePose]:
+        """Hypotheses from the hull alone, best first, limbs as they fell. betas: of the same person in
+        another frame, if known."""
+        stands, low = stances(self.mean_pose())
+        none = np.zeros(self.n_model_betas)
+        bodies = [(stands, none), (stands, self.standing_betas(scan)), (low, none)]
+        if betas is not None:
+            bodies = [(stands, betas), (low, betas)]
         headings = 2.0 * np.pi * np.arange(N_HEADINGS) / N_HEADINGS
-        tried = [self.facing(scan, heading, first) for heading in headings for first in starts]
-        for sigma, iterations, kept in (
-            (0.3, 6, 2 * KEPT),
-            (0.15, 6, KEPT),
-            (0.08, 6, KEPT),
-            (0.05, 6, KEPT),
-        ):
-            tried = [refine(self.body, scan, self.prior, at, (sigma,), iterations) for at in tried]
-            tried = sorted(tried, key=lambda at: at.score)[:kept]
-        best = tried[0]
-        reseeded = [self.reseed_arms(scan, best)]
-        # The best of those that face another way has its arms tried too: it might be the true one with an arm
-        # lost.
-        others = [at for at in tried[1:] if heading_difference(at, best) > OTHER_HEADING]
-        reseeded += [self.reseed_arms(scan, at) for at in others[:1]]
-        return sorted(reseeded, key=lambda at: at.score)
+        tried = [self.facing(scan, heading, b, stance) for heading in headings for stance, b in bodies]
+        for sigma, iterations, kept in SEARCH:
+            tried = [refine(self.quick, scan, self.prior, at, (sigma,), iterations) for at in tried]
+            tried = self._different(sorted(tried, key=lambda at: at.score))[:kept]
+        return tried
 
-    def reseed_arms(self, scan: CoarseScan, at: CoarsePose) -> CoarsePose:
-        """Try other arm configurations, one side at a time; keep what scores best."""
-        for arm, seeds in zip(ARMS, self.arm_seeds, strict=True):
-            trials = []
-            for seed in seeds:
-                pose = at.pose.copy()
-                pose[list(arm)] = seed
-                trial = CoarsePose(pose, at.translation, at.betas)
-                trials.append(CoarsePose(pose, at.translation, at.betas, self.score(scan, trial)))
-            best = at
-            for start in sorted(trials, key=lambda trial: trial.score)[:REFINED_ARMS]:
-                trial = refine(self.body, scan, self.prior, start, COARSE_TO_FINE_M[2:], iterations=4)
-                if trial.score < best.score:
-                    best = trial
-            at = best
+    def _different(self, hypotheses: list[CoarsePose]) -> list[CoarsePose]:
+        """Those that no earlier one is the same as: starts that ran into one pose are worth one place."""
+        kept: list[CoarsePose] = []
+        joints: list[np.ndarray] = []
+        for at in hypotheses:
+            own = self.quick.forward(at).origin
+            if all(np.linalg.norm(own - other, axis=1).mean() > SAME_M for other in joints):
+                kept.append(at)
+                joints.append(own)
+        return kept
+
+    def from_hull(
+        self,
+        scan: CoarseScan,
+        betas: np.ndarray | None = None,
+        hypotheses: Sequence[CoarsePose] | None = None,
+    ) -> list[CoarsePose]:
+        """Hypotheses from the hull alone, best first, every limb tried elsewhere. hypotheses: of `search`,
+        where it was done already."""
+        tried = list(hypotheses) if hypotheses else self.search(scan, betas)
+        best = tried[0]
+        # The best of those that face another way has its limbs tried too: it might be the true one with an
+        # arm lost.
+        others = [at for at in tried[1:] if heading_difference(at, best) > OTHER_HEADING]
+        reseeded = [self.reseed(scan, at) for at in [best, *others[:1]]]
+        fine = [refine(self.body, scan, self.prior, at, COARSE_TO_FINE_M[2:], 4) for at in reseeded]
+        return sorted(fine, key=lambda at: at.score)
+
+    def reseed(self, scan: CoarseScan, at: CoarsePose) -> CoarsePose:
+        """Try other configurations of arms and legs, one limb at a time; keep what scores best.
+
+        Once more and more widely where a part of the scan is still far from all of the body: a limb may have
+        stood in another's place.
+        """
+        for sigmas_m in (COARSE_TO_FINE_M[2:], COARSE_TO_FINE_M[1:]):
+            for limbs, seeds, refined in (
+                (ARMS, self.arm_seeds, REFINED_ARMS),
+                (LEGS, self.leg_seeds, REFINED_LEGS),
+            ):
+                for limb, own_seeds in zip(limbs, seeds, strict=True):
+                    at = self._reseed_limb(scan, at, limb, own_seeds, refined, sigmas_m)
+            if left_out(self.quick, scan, at) < LEFT_OUT:
+                break
         return at
+
+    def _reseed_limb(
+        self,
+        scan: CoarseScan,
+        at: CoarsePose,
+        limb: tuple[int, ...],
+        seeds: Float[np.ndarray, "s k 3"],
+        refined: int,
+        sigmas_m: tuple[float, ...],
+    ) -> CoarsePose:
+        trials = []
+        for seed in seeds:
+            pose = at.pose.copy()
+            pose[list(limb)] = seed
+            trial = CoarsePose(pose, at.translation, at.betas)
+            trials.append(replace(trial, score=score(self.quick, scan, trial)))
+        best = at
+        for start in sorted(trials, key=lambda trial: trial.score)[:refined]:
+            trial = refine(self.quick, scan, self.prior, start, sigmas_m, iterations=4)
+            if trial.score < best.score:
+                best = trial
+        return best
 
     def from_previous(
         self, scan: CoarseScan, previous: CoarsePose, previous_centroid: np.ndarray
@@ -168,32 +227,6 @@ class PoseFinder:
     def score(self, scan: CoarseScan, at: CoarsePose) -> float:
         """Mean symmetric distance, m."""
         return score(self.body, scan, at)
-
-
-def arm_configurations() -> Float[np.ndarray, "2 s 4 3"]:
-    """Rotation vectors of collar, shoulder, elbow, wrist for the left and the right arm, over all that arms
-    do.
-
-    Upper arms point in ten directions around the shoulder, with the elbow nearly straight; in five of them
-    also bent. From the T-pose, x to the body's left, y up, z to the front.
-    """
-    directions = {
-        "down": (0.15, -1.0, 0.05), "side": (1.0, 0.0, 0.0), "front": (0.1, -0.1, 1.0),
-        "up": (0.25, 1.0, 0.0), "up front": (0.3, 0.7, 0.7), "up side": (0.7, 0.7, 0.0),
-        "down front": (0.2, -0.7, 0.7),
-        "down side": (0.7, -0.7, 0.1), "across": (-0.4, -0.2, 1.0), "down back": (0.3, -0.8, -0.5),
-    }  # fmt: skip
-    bent = ("down", "side", "front", "up side", "down front")
-    rows = []
-    for name, direction in directions.items():
-        to = np.asarray(direction) / np.linalg.norm(direction)
-        axis = np.cross([1.0, 0.0, 0.0], to)
-        length = np.linalg.norm(axis)
-        shoulder = axis / max(length, 1e-9) * np.arctan2(length, to[0])
-        for flexion in (0.3, 1.6) if name in bent else (0.3,):
-            rows.append([np.zeros(3), shoulder, np.array([0.0, -flexion, 0.0]), np.zeros(3)])
-    left = np.array(rows)
-    return np.stack([left, left * np.array([1.0, -1.0, -1.0])])
 
 
 def heading_difference(a: CoarsePose, b: CoarsePose) -> float:

@@ -131,11 +131,23 @@ def test_what_is_no_detection_is_named(tmp_path):
     with pytest.raises(RecordingError, match="no keypoints for any camera; expected a folder a camera"):
         read_keypoints(tmp_path, ("cam-000",), 0)
     path = tmp_path / "cam-000" / "000000.json"
-    write_frame(path, [np.zeros((18, 3))])
-    with pytest.raises(RecordingError, match=r"000000\.json: a person with 54 numbers, BODY_25 has 75"):
+    write_frame(path, [np.zeros((15, 3))])
+    with pytest.raises(
+        RecordingError, match=r"000000\.json: a person with 45 numbers, BODY_25 has 75 and COCO 54"
+    ):
         read_keypoints(tmp_path, ("cam-000",), 0)
     path.write_text('{"people": [')
-    with pytest.raises(RecordingError, match=r"000000\.json: no OpenPose output"):
+    with pytest.raises(RecordingError, match=r"000000\.json: cannot be read as JSON"):
+        read_keypoints(tmp_path, ("cam-000",), 0)
+    path.write_text('{"people": [{"face": []}]}')
+    with pytest.raises(RecordingError, match=r"000000\.json: no OpenPose output \(KeyError"):
+        read_keypoints(tmp_path, ("cam-000",), 0)
+    path.write_text('{"version": 1.3}')
+    with pytest.raises(
+        RecordingError,
+        match=r"neither OpenPose's output \(people\) nor COCO's keypoints \(a list, or annotations\); "
+        "found keys version",
+    ):
         read_keypoints(tmp_path, ("cam-000",), 0)
 
 

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from fit.body.model import load_body
 from fit.body.pose_prior import PosePrior
 from fit.coarse import CoarsePose, CoarseScan, left_jacobian_inverse
-from fit.initialise import PoseFinder, arm_configurations
+from fit.initialise import PoseFinder
+from fit.limb_seeds import arm_configurations, leg_configurations, stances
 from fit.solver import Fitter
 from fit.state import BodyState
 from hull.scan import even_samples
@@ -86,7 +87,7 @@ def test_heading_is_found_without_a_flip(heading_deg):
 def test_arms_are_found_wherever_they_are(arm):
     left, _ = arm_configurations()
     pose = finder().mean_pose()
-    rows = {"up": 5, "front": 3, "bent": 1}
+    rows = {"up": 10, "front": 7, "bent": 1}
     for side, joints in enumerate(((13, 16, 18, 20), (14, 17, 19, 21))):
         pose[list(joints)] = left[rows[arm]] * (np.array([1, -1, -1]) if side else 1)
     scan, joints = scanned(pose)
@@ -95,6 +96,42 @@ def test_arms_are_found_wherever_they_are(arm):
     assert error[[18, 19, 20, 21]].max() < 0.12, (
         f"elbows and wrists are off by {1e3 * error[18:22].round(3)} mm"
     )
+
+
+@pytest.mark.parametrize("low", ["sits, hands on the head", "kneels"])
+def test_people_near_the_ground_are_found(low):
+    """A standing child with its legs in the ground would fit the heights, too."""
+    pose = stances(finder().mean_pose())[1]
+    if low == "kneels":
+        pose[[1, 4]], pose[[2, 5]] = [[-1.4, 0, 0], [1.5, 0, 0]], [[0.0, 0, 0], [1.6, 0, 0]]
+    else:
+        for shoulder, elbow, mirror in ((16, 18, 1.0), (17, 19, -1.0)):
+            pose[shoulder], pose[elbow] = [-1.3, 0.3 * mirror, 0.4 * mirror], [0, -2.2 * mirror, 0]
+    pose[0] = [0.0, 2.3, 0.0]
+    scan, joints = scanned(pose)
+    best = finder().from_hull(scan)[0]
+    error = np.linalg.norm(joints_of(best) - joints, axis=1)
+    assert error.mean() < 0.045, f"joints are {1e3 * error.mean():.0f} mm off on average"
+    assert error.max() < 0.15, f"the worst joint is {1e3 * error.max():.0f} mm off"
+
+
+def test_limbs_are_tried_alike_on_both_sides():
+    for left, right in (arm_configurations(), leg_configurations()):
+        np.testing.assert_allclose(left * [1, -1, -1], right)
+
+
+def test_the_prior_gives_way_as_the_pose_gets_near():
+    prior = finder().prior
+    assert prior.weight_at(0.3) == prior.weight_at(0.15) == prior.pose_weight
+    assert prior.weight_at(0.05) == pytest.approx(prior.pose_weight / 9)
+    assert prior.weight_at(0.05, doubt=1.0) == prior.pose_weight
+
+
+def test_a_loose_hull_is_doubtful():
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    even, uneven = np.ones(50), np.where(np.arange(50) % 2, 1.5, 0.5)
+    assert CoarseScan.of(points, points, weight=even).doubt == CoarseScan.of(points, points).doubt == 0.0
+    assert CoarseScan.of(points, points, weight=uneven).doubt == 1.0
 
 
 def test_keypoints_with_gaps_give_the_pose():

@@ -4,23 +4,22 @@ filmed.
 Two of OpenPose's models have 25 points in different orders, and the files do not say which: BODY_25 (with
 neck and middle of the hips) and the later BODY_25B (with upper neck and top of the head, no middle of the
 hips). They are told apart by what must lie where in any person: the middle of the hips between the hips, or
-the nose between the eyes.
+the nose between the eyes. The older COCO model has 18 points: those of BODY_25 without the middle of the hips
+and the feet, and hips before eyes.
 """
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Sequence
-from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from capture.errors import RecordingError
 
-N_JOINTS = 25
+N_JOINTS, N_COCO_18 = 25, 18
 _SEEN = 0.2
 # BODY_25's joint: the BODY_25B joints whose mean it is.
 _FROM_25B = (
@@ -28,45 +27,21 @@ _FROM_25B = (
     (2,), (1,), (4,), (3,), (19,), (20,), (21,), (22,), (23,), (24,),
 )  # fmt: skip
 
+# The same of the 18 points of OpenPose's COCO model.
+_FROM_18 = (
+    (0,), (1,), (2,), (3,), (4,), (5,), (6,), (7,), (8, 11), (8,), (9,), (10,), (11,), (12,), (13,),
+    (14,), (15,), (16,), (17,), (), (), (), (), (), (),
+)  # fmt: skip
+
 People = Float[np.ndarray, "_p 25 3"]
 
 
-def read_keypoints(folder: Path | str, camera_names: Sequence[str], frame_id: int) -> list[People]:
-    """One frame's detections: for each camera (P 25 3), x y in pixels as filmed and a score; P is 0 where
-    none.
-
-    Files: FOLDER/<camera>/NNNNNN.json or FOLDER/<camera>/*NNNNNN_keypoints.json, the frame's number with any
-    width. A missing file or camera means no detection; raises RecordingError where no camera has a folder,
-    or a file is no OpenPose output.
-    """
-    folder = Path(folder)
-    folders = [folder / name for name in camera_names]
-    if not any(path.is_dir() for path in folders):
-        raise RecordingError(
-            f"{folder}: no keypoints for any camera; expected a folder a camera "
-            f"({', '.join(camera_names[:3])}, ...) with one JSON file a frame"
-        )
-    result: list[People] = []
-    for camera_folder in folders:
-        path = _frame_file(camera_folder, frame_id) if camera_folder.is_dir() else None
-        result.append(np.zeros((0, N_JOINTS, 3)) if path is None else _read_people(path))
-    if _folder_is_body_25b(folder, tuple(camera_names)):
-        return [_body_25_from_25b(people) for people in result]
-    return result
+def is_openpose(content: Any) -> bool:
+    """Whether parsed JSON looks like OpenPose's: a dictionary with people."""
+    return isinstance(content, dict) and "people" in content
 
 
-@lru_cache(maxsize=8)
-def _folder_is_body_25b(folder: Path, camera_names: tuple[str, ...]) -> bool:
-    """The order of a whole folder of detections, from a dozen frames of every camera: single frames can
-    mislead."""
-    sample = []
-    for name in camera_names:
-        files = sorted((folder / name).glob("*.json"))
-        sample += files[:: max(1, len(files) // 12)]
-    return _is_body_25b([_read_people(path) for path in sample])
-
-
-def _is_body_25b(per_camera: Sequence[People]) -> bool:
+def is_body_25b(per_camera: Sequence[People]) -> bool:
     """True where the detections, taken together, fit the order of BODY_25B better than
     BODY_25's."""
     misfits = []
@@ -91,7 +66,7 @@ def _off_middle(person: Float[np.ndarray, "25 3"], triples: tuple[tuple[int, int
     return float(np.linalg.norm(off, axis=1).mean())
 
 
-def _body_25_from_25b(people: People) -> People:
+def body_25_from_25b(people: People) -> People:
     """The same people in BODY_25 order; a point made of two has the lower score, 0 if either is missing."""
     result = np.zeros_like(people)
     for joint_idx, sources in enumerate(_FROM_25B):
@@ -100,29 +75,31 @@ def _body_25_from_25b(people: People) -> People:
     return result
 
 
-def _frame_file(folder: Path, frame_id: int) -> Path | None:
-    usual = folder / f"{frame_id:06d}.json"
-    if usual.is_file():
-        return usual
-    for path in sorted(folder.glob("*.json")):
-        number = re.search(r"(\d+)(?:_keypoints)?$", path.stem)
-        if number is not None and int(number[1]) == frame_id:
-            return path
-    return None
-
-
-def _read_people(path: Path) -> People:
+def read_people(content: Any, path: Path) -> People:
+    """The people of a parsed file (P 25 3), in the order of the file, or from COCO's 18 points."""
     try:
-        people = json.loads(path.read_text(encoding="utf-8"))["people"]
-        flat = [np.array(person["pose_keypoints_2d"], dtype=np.float64) for person in people]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        flat = [np.array(person["pose_keypoints_2d"], dtype=np.float64) for person in content["people"]]
+    except (ValueError, KeyError, TypeError) as error:
         raise RecordingError(f"{path}: no OpenPose output ({type(error).__name__}: {error})") from error
+    people = []
     for values in flat:
-        if values.shape != (3 * N_JOINTS,):
+        if values.shape not in ((3 * N_JOINTS,), (3 * N_COCO_18,)):
             raise RecordingError(
-                f"{path}: a person with {values.size} numbers, BODY_25 has {3 * N_JOINTS}; "
-                "run OpenPose with its BODY_25 model"
+                f"{path}: a person with {values.size} numbers, BODY_25 has {3 * N_JOINTS} and COCO "
+                f"{3 * N_COCO_18}; run OpenPose with its BODY_25 model"
             )
         if not np.isfinite(values).all():
             raise RecordingError(f"{path}: a keypoint is not a finite number")
-    return np.array(flat).reshape(-1, N_JOINTS, 3)
+        points = values.reshape(-1, 3)
+        people.append(points if len(points) == N_JOINTS else _body_25_from_18(points))
+    return np.array(people).reshape(-1, N_JOINTS, 3)
+
+
+def _body_25_from_18(person: Float[np.ndarray, "18 3"]) -> Float[np.ndarray, "25 3"]:
+    """A person of the older COCO model: the middle of the hips is made of them, feet are missing."""
+    result = np.zeros((N_JOINTS, 3))
+    for joint_idx, sources in enumerate(_FROM_18):
+        if sources and person[list(sources), 2].min() > 0:
+            result[joint_idx, :2] = person[list(sources), :2].mean(axis=0)
+            result[joint_idx, 2] = person[list(sources), 2].min()
+    return result
