@@ -123,10 +123,11 @@ def fuse_together(
     template, joints = fitter.shaped(together.betas), fitter.joints(together.betas)
     clothed = np.stack([a.state.template for a in alignments])
     normals = vertex_normals(template, model.faces)
-    expected = clothed.mean(0) - together.thickness.expected[:, None] * normals
     certainty = (settings.thickness.tolerance_m / together.thickness.tolerance) ** 2
     offsets = np.einsum("tva,va->tv", clothed - clothed.mean(0), normals)
-    speak = ~lost_points(offsets)
+    speak = ~lost_points(offsets, fitter.laplacian)
+    mean = (speak[:, :, None] * clothed).sum(0) / np.maximum(speak.sum(0), 1)[:, None]
+    expected = mean - together.thickness.expected[:, None] * normals
     if offsets.size > MOST_POINTS:  # the union of hundreds of frames: a part of each says the same
         speak &= np.random.default_rng(0).random(offsets.shape) * offsets.size < MOST_POINTS
     frame_normals = np.stack([vertex_normals(t, model.faces) for t in clothed])
@@ -181,7 +182,11 @@ def fuse(
     mean = templates.mean(0)
     normals = vertex_normals(mean, fitter.model.faces)
     offsets = np.einsum("tva,va->tv", templates - mean, normals)
-    keep = ~lost_points(offsets) if len(good) >= ENOUGH_FRAMES else np.ones(offsets.shape, dtype=bool)
+    keep = (
+        ~lost_points(offsets, fitter.laplacian)
+        if len(good) >= ENOUGH_FRAMES
+        else np.ones(offsets.shape, dtype=bool)
+    )
     points = templates.reshape(-1, 3)
     scan = ScanPoints(
         points,

@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.sparse import csr_matrix
 
 #: Offsets so many robust deviations from the others' median, and at least so far, are lost.
 CLIP_MAD = 3.5
 CLIP_FLOOR_M = 0.004
+#: A vertex this far inside the mean of its neighbours, a centimetre or two away, is no fold.
+DENT_M = 0.008
 
 
 def allowance(
@@ -23,20 +26,30 @@ def allowance(
     return median, np.maximum(clip_mad * spread, floor_m)
 
 
-def lost_points(offsets: Float[np.ndarray, "t v"]) -> Bool[np.ndarray, "t v"]:
-    """Which unposed vertices lie implausibly far inside their fellows of the other frames.
+def lost_points(
+    offsets: Float[np.ndarray, "t v"], laplacian: csr_matrix | None = None
+) -> Bool[np.ndarray, "t v"]:
+    """Which unposed vertices lie implausibly far inside their fellows of the other frames, or, with the
+    mesh's laplacian (V V), inside their neighbours of the same frame.
 
     offsets: along the common normal, positive outwards, m. Only inward outliers are dropped: they alone pull
     the shape in, and the outside term has little resistance against them.
     """
     median, allowed = allowance(offsets)
-    return offsets < median - allowed
+    lost = offsets < median - allowed
+    if laplacian is not None:
+        lost |= ((laplacian @ offsets.T) / laplacian.diagonal()[:, None]).T < -DENT_M
+    return lost
 
 
-def robust_variance(offsets: Float[np.ndarray, "t v"]) -> Float[np.ndarray, "v"]:
-    """Variance over the frames of the offsets (m) that are plausible."""
+def robust_variance(
+    offsets: Float[np.ndarray, "t v"], lost: Bool[np.ndarray, "t v"] | None = None
+) -> Float[np.ndarray, "v"]:
+    """Variance over the frames of the offsets (m) that are plausible, and not known to be lost."""
     median, allowed = allowance(offsets)
     plausible = np.abs(offsets - median) <= allowed
-    count = plausible.sum(axis=0)  # the median's neighbours are always among them
+    if lost is not None:
+        plausible &= ~lost
+    count = np.maximum(plausible.sum(axis=0), 1)
     mean = (offsets * plausible).sum(axis=0) / count
     return (plausible * (offsets - mean) ** 2).sum(axis=0) / count

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix
 
 from fit.body.model import BodyModel
@@ -86,15 +86,16 @@ def expected_thickness(
     faces: Int[np.ndarray, "f 3"],
     settings: ThicknessSettings,
     excess: Float[np.ndarray, "v"] | float = 0.0,
+    lost: Bool[np.ndarray, "t v"] | None = None,
 ) -> Thickness:
     """From offsets of the cloth to the body along the normal (m, positive outwards) in all frames.
 
     noise: deviation (m) that is not cloth (`bending_noise`); ratio: `thickness_per_movement`; excess: how far
-    what was measured stands off the cloth. Deviations are pooled over the neighbourhood before they are
-    compared.
+    what was measured stands off the cloth; lost: `lost_points`. Deviations are pooled over the neighbourhood
+    before they are compared.
     """
     # One frame with an arm against the trunk must not pass for a coat.
-    variance = np.minimum(robust_variance(offsets), settings.largest_movement_m**2)
+    variance = np.minimum(robust_variance(offsets, lost), settings.largest_movement_m**2)
     variance = smoothed_over_mesh(variance, faces, settings.pooling_rounds)
     own = settings.noise_m**2 + smoothed_over_mesh(noise**2, faces, settings.pooling_rounds)
     movement = np.sqrt(np.maximum(variance - own, 0.0))

@@ -134,7 +134,7 @@ def fit_together(
                 thickness, _, moved = _round(fitter, finder, cloth, at, few, settings, None)
                 if moved < weights.near:
                     break
-            for k in np.setdiff1d(chosen, few):
+            for k in np.setdiff1d(chosen, few).tolist():
                 _settle(fitter, finder, cloth, at, k, settings, thickness)
         for _ in range(weights.rounds):
             thickness, energy, moved = _round(fitter, finder, cloth, at, chosen, settings, None)
@@ -142,7 +142,7 @@ def fit_together(
             if moved < weights.rest or _at_rest(energies, weights.relative_drop):
                 break
         assert thickness is not None, "at least one round"
-        for k in np.setdiff1d(np.arange(n), chosen):
+        for k in np.setdiff1d(np.arange(n), chosen).tolist():
             _settle(fitter, finder, cloth, at, k, settings, thickness)
     return Together(at.poses, at.translations, at.betas, thickness, tuple(energies))
 
@@ -200,9 +200,9 @@ def _round(
     if thickness is None:
         noise = bending_noise(model, at.poses[chosen], vertex_normals(template, model.faces))
         offsets = np.stack([f[2] for f in frames])
-        lost = lost_points(offsets)
+        lost = lost_points(offsets, fitter.laplacian)
         thickness = expected_thickness(
-            offsets, noise, cloth.ratio, model.faces, settings.thickness, cloth.excess
+            offsets, noise, cloth.ratio, model.faces, settings.thickness, cloth.excess, lost
         )
         thickness = undressed(thickness, cloth.bare, settings.thickness)
     n_betas = 0 if held is not None else model.n_betas

@@ -138,7 +138,8 @@ def expected_excess(slack_m: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]
     between the cameras' tangents over eight. The angle is the same for the whole rig, and the median slack
     measures it. EXCESS_PER_M is from hulls of people, dressed and not, by 8 to 68 cameras: means of 4.8 to
     6.2 mm with 8, 2.2 to 2.8 with 16, 1.3 to 1.7 with 32, 0.7 to 1.0 with 68; a single place may differ by as
-    much again.
+    much again. Pixels were 1 to 2 mm wide; with wider ones slack is never small, and too much is expected (1
+    mm, with pixels of 4 mm).
     """
     return EXCESS_PER_M * float(np.median(slack_m)) * np.minimum(slack_m, LARGEST_SLACK_M)
 

@@ -9,7 +9,8 @@ from fit.align import Alignment, align_sequence, mean_distance
 from fit.closest import Container
 from fit.evaluate import Surface, pose_truth_to, signed_error_mm, summarise, transfer_rig
 from fit.frames import apply, recording_from_body, scan_in_body_frame
-from fit.fuse import fit_scale_from_spread, fuse, lost_points, trust_in_spread
+from fit.fuse import fit_scale_from_spread, fuse, trust_in_spread
+from fit.outliers import lost_points, robust_variance
 from fit.settings import FitSettings
 from fit.state import BodyState
 from fit.surface import vertex_normals
@@ -123,6 +124,18 @@ def test_lost_points_are_the_inward_outliers_only():
     assert lost[3, :10].all()
     assert not lost[5, 20:30].any()
     assert lost.mean() < 0.01
+    assert robust_variance(offsets)[:10].mean() < 2.0 * robust_variance(offsets)[30:].mean()
+    assert offsets[:, :10].var(axis=0).mean() > 20.0 * offsets[:, 30:].var(axis=0).mean()
+
+
+def test_a_vertex_deep_inside_its_neighbours_is_lost_however_much_the_cloth_moves():
+    swing = 0.02 * np.sin(2 * np.pi * np.arange(12) / 12)
+    offsets = np.repeat(swing[:, None], fitter().model.n_vertices, axis=1)
+    offsets[2, 100] -= 0.03
+    assert not lost_points(offsets)[2, 100]
+    lost = lost_points(offsets, fitter().laplacian)
+    assert lost[2, 100]
+    assert lost.sum() == 1
 
 
 def test_spread_lowers_the_fit_weight_only_where_it_can_be_trusted():

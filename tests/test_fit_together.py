@@ -172,9 +172,44 @@ def test_what_bending_does_is_not_cloth():
     offsets = noise * np.array([-1.2, -0.6, 0.6, 1.2])[:, None]
     ratio = thickness_per_movement(model)
     thickness = expected_thickness(offsets, noise, ratio, model.faces, SETTINGS.thickness)
-    np.testing.assert_allclose(thickness.expected, SETTINGS.thickness.thinnest_m, atol=1e-4)
+    np.testing.assert_allclose(thickness.expected, 0.0, atol=1e-4)
     more = expected_thickness(offsets, 0.0 * noise, ratio, model.faces, SETTINGS.thickness)
     assert more.expected[knee].max() > 0.003
+
+
+def test_what_the_hull_stands_off_is_expected_on_top_of_the_cloth():
+    model, settings = fitter().model, SETTINGS.thickness
+    rng = np.random.default_rng(4)
+    offsets = 0.02 + 0.005 * rng.normal(size=(8, 1)) * np.ones((8, model.n_vertices))
+    ratio, none = thickness_per_movement(model), np.zeros(model.n_vertices)
+    cloth = expected_thickness(offsets, none, ratio, model.faces, settings)
+    hull = expected_thickness(offsets, none, ratio, model.faces, settings, np.full(model.n_vertices, 0.004))
+    np.testing.assert_allclose(hull.expected - cloth.expected, settings.excess_share * 0.004, atol=1e-12)
+    np.testing.assert_array_equal(hull.movement, cloth.movement)
+
+
+def test_known_skin_has_no_cloth_over_it():
+    bare = covered().astype(float)
+    together = fit_together(fitter(), finder(), clothed(0.02), SETTINGS, bare)
+    assert together.thickness.expected[covered()].max() < 1e-9
+    assert np.allclose(together.thickness.tolerance[covered()], SETTINGS.thickness.tolerance_m)
+    assert np.median(found(0.02)[0].thickness.expected[covered()]) > 0.01
+
+
+def test_one_percent_of_points_lost_inside_costs_less_than_half_a_millimetre():
+    rng, model = np.random.default_rng(6), fitter().model
+    for mean_m in (0.0, 0.02):
+        spoilt = []
+        for alignment in clothed(mean_m):
+            template = alignment.state.template.copy()
+            lost = rng.random(len(template)) < 0.01
+            depth = rng.uniform(0.02, 0.06, (int(lost.sum()), 1))
+            template[lost] -= depth * vertex_normals(template, model.faces)[lost]
+            spoilt.append(replace(alignment, state=alignment.state.moved(template=template)))
+        fusion, again = fused(fitter(), finder(), spoilt, SETTINGS)
+        shapes = (found(mean_m)[1:], (fusion, tuple(again)))
+        clean, now = (float(np.sqrt((error_mm(*shape) ** 2).mean())) for shape in shapes)
+        assert now - clean < 0.5, f"{1e3 * mean_m:.0f} mm of cloth: {clean:.2f} mm clean, {now:.2f} mm spoilt"
 
 
 def test_a_frames_equations_are_those_of_dense_derivatives():
