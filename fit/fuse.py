@@ -124,6 +124,8 @@ def fuse_together(
     clothed = np.stack([a.state.template for a in alignments])
     normals = vertex_normals(template, model.faces)
     certainty = (settings.thickness.tolerance_m / together.thickness.tolerance) ** 2
+    # Where the skin is seen, the person counts and the model's coupling does not.
+    pull = certainty * (1.0 + settings.sure_pull * certainty**2)
     offsets = np.einsum("tva,va->tv", clothed - clothed.mean(0), normals)
     speak = ~lost_points(offsets, fitter.laplacian)
     mean = (speak[:, :, None] * clothed).sum(0) / np.maximum(speak.sum(0), 1)[:, None]
@@ -137,7 +139,7 @@ def fuse_together(
     scan = ScanPoints(
         np.concatenate([clothed[speak], expected]),
         np.concatenate([frame_normals[speak], normals]),
-        np.concatenate([np.full(n_cloth, n_points / n_cloth), certainty * n_points / n_vertices]),
+        np.concatenate([np.full(n_cloth, n_points / n_cloth), pull * n_points / n_vertices]),
         np.repeat([False, True], [n_cloth, n_vertices]),
     )
     state = BodyState(template, np.zeros((model.n_joints, 3)), np.zeros(3), together.betas)

@@ -65,15 +65,17 @@ def _track_template() -> StageWeights:
 class ThicknessSettings:
     """How movement of the cloth tells its thickness (`fit.thickness`).
 
-    per_movement: factor on the ratio of thickness to deviation along the normal; excess_share: of a
-    hull's expected excess that alignments follow; swing_m: movement whose thickness is half of what the
+    per_movement: factor on the ratio of thickness to deviation along the normal; excess_shares: of a
+    hull's expected excess, how much an alignment stands off skin, and off cloth of folded_m or more, in whose
+    folds no outline can reach; swing_m: movement whose thickness is half of what the
     ratio says; tolerance_share: how far that may be off; tolerance_m, noise_m: tolerance and deviation where
     there is no cloth; largest_movement_m: more is no cloth either; pooling_rounds: means over neighbours
     before deviations are compared.
     """
 
     per_movement: float = 1.0
-    excess_share: float = 0.9
+    excess_shares: tuple[float, float] = (0.5, 1.0)
+    folded_m: float = 0.01
     swing_m: float = 0.04
     tolerance_share: float = 0.4
     tolerance_m: float = 0.002
@@ -132,6 +134,9 @@ class FitSettings:
     fuse: tuple[StageWeights, ...] = (_fusion_stage(5.0), _fusion_stage(0.1))
     #: The same where the clothes' thickness is known: the skin term holds what is expected under the cloth.
     fuse_together: tuple[StageWeights, ...] = (_fusion_together(5.0), _fusion_together(0.1))
+    #: Added to the pull on the fusion shape where the skin is known best; it falls with the square of the
+    #: certainty.
+    sure_pull: float = 10.0
     #: Factor on lambda_fit in tracking where the skin is known best; it falls with the third power of the
     #: certainty, so that bare parts follow the scan and covered ones the fusion shape.
     sure_fit: float = 60.0

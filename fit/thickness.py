@@ -101,7 +101,10 @@ def expected_thickness(
     movement = np.sqrt(np.maximum(variance - own, 0.0))
     # Cloth that swings by centimetres does not stand away in proportion.
     damped = movement / (1.0 + movement / settings.swing_m)
-    expected = settings.excess_share * excess + settings.per_movement * ratio * damped
+    cloth = settings.per_movement * ratio * damped
+    on_skin, on_cloth = settings.excess_shares
+    folded = np.minimum(cloth / settings.folded_m, 1.0)
+    expected = cloth + (on_skin + (on_cloth - on_skin) * folded) * excess
     tolerance = np.sqrt(settings.tolerance_m**2 + own + (settings.tolerance_share * expected) ** 2)
     return Thickness(expected, tolerance, movement)
 

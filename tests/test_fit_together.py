@@ -180,12 +180,15 @@ def test_what_bending_does_is_not_cloth():
 def test_what_the_hull_stands_off_is_expected_on_top_of_the_cloth():
     model, settings = fitter().model, SETTINGS.thickness
     rng = np.random.default_rng(4)
-    offsets = 0.02 + 0.005 * rng.normal(size=(8, 1)) * np.ones((8, model.n_vertices))
+    swing = rng.normal(size=(8, 1)) * np.ones((8, model.n_vertices))
     ratio, none = thickness_per_movement(model), np.zeros(model.n_vertices)
-    cloth = expected_thickness(offsets, none, ratio, model.faces, settings)
-    hull = expected_thickness(offsets, none, ratio, model.faces, settings, np.full(model.n_vertices, 0.004))
-    np.testing.assert_allclose(hull.expected - cloth.expected, settings.excess_share * 0.004, atol=1e-12)
-    np.testing.assert_array_equal(hull.movement, cloth.movement)
+    stands_off = np.full(model.n_vertices, 0.004)
+    for movement_m, share in ((0.0, settings.excess_shares[0]), (0.01, settings.excess_shares[1])):
+        offsets = 0.02 + movement_m * swing
+        cloth = expected_thickness(offsets, none, ratio, model.faces, settings)
+        hull = expected_thickness(offsets, none, ratio, model.faces, settings, stands_off)
+        np.testing.assert_allclose(hull.expected - cloth.expected, share * 0.004, atol=1e-12)
+        np.testing.assert_array_equal(hull.movement, cloth.movement)
 
 
 def test_known_skin_has_no_cloth_over_it():
