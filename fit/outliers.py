@@ -13,6 +13,7 @@ from scipy.sparse import csr_matrix
 #: Offsets so many robust deviations from the others' median, and at least so far, are lost.
 CLIP_MAD = 3.5
 CLIP_FLOOR_M = 0.004
+ENOUGH_FRAMES = 8
 #: A vertex this far inside the mean of its neighbours, a centimetre or two away, is no fold.
 DENT_M = 0.008
 
@@ -45,11 +46,14 @@ def lost_points(
 def robust_variance(
     offsets: Float[np.ndarray, "t v"], lost: Bool[np.ndarray, "t v"] | None = None
 ) -> Float[np.ndarray, "v"]:
-    """Variance over the frames of the offsets (m) that are plausible, and not known to be lost."""
-    median, allowed = allowance(offsets)
-    plausible = np.abs(offsets - median) <= allowed
-    if lost is not None:
-        plausible &= ~lost
+    """Unbiased variance over the frames of the offsets (m) that are plausible, and not known to be lost.
+
+    What is plausible is told from ENOUGH_FRAMES on: among fewer, the one that differs is most of what moves.
+    """
+    plausible = np.ones(offsets.shape, dtype=bool) if lost is None else ~lost
+    if len(offsets) >= ENOUGH_FRAMES:
+        median, allowed = allowance(offsets)
+        plausible &= np.abs(offsets - median) <= allowed
     count = np.maximum(plausible.sum(axis=0), 1)
     mean = (offsets * plausible).sum(axis=0) / count
-    return (plausible * (offsets - mean) ** 2).sum(axis=0) / count
+    return (plausible * (offsets - mean) ** 2).sum(axis=0) / np.maximum(count - 1, 1)

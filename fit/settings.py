@@ -74,7 +74,7 @@ class ThicknessSettings:
     """
 
     per_movement: float = 1.0
-    excess_shares: tuple[float, float] = (0.5, 1.0)
+    excess_shares: tuple[float, float] = (0.4, 1.0)
     folded_m: float = 0.01
     swing_m: float = 0.04
     tolerance_share: float = 0.4

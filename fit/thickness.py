@@ -76,7 +76,7 @@ def bending_noise(
     moves = (model.pose_directions.reshape(3 * model.n_vertices, -1) @ features.T).reshape(
         model.n_vertices, 3, -1
     )
-    return np.einsum("vat,va->vt", moves, normals).std(axis=1)
+    return np.einsum("vat,va->vt", moves, normals).std(axis=1, ddof=1)
 
 
 def expected_thickness(

@@ -28,9 +28,9 @@ _NUDGE_PX = 0.5
 # Slack is measured at no more vertices than this and spread to their neighbours: it changes slowly, and finer
 # grids should not cost more rays.
 MAX_MEASURED = 24_000
-#: Excess over the product of a place's slack and the hull's median slack; more slack than the second says
-#: phantom, not excess.
-EXCESS_PER_M, LARGEST_SLACK_M = 2.7, 0.15
+#: Excess over the product of a place's slack and the hull's median slack; more than the second is a phantom,
+#: which alignments do not follow.
+EXCESS_PER_M, LARGEST_EXCESS_M = 2.7, 0.008
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,7 @@ def expected_excess(slack_m: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]
     much again. Pixels were 1 to 2 mm wide; with wider ones slack is never small, and too much is expected (1
     mm, with pixels of 4 mm).
     """
-    return EXCESS_PER_M * float(np.median(slack_m)) * np.minimum(slack_m, LARGEST_SLACK_M)
+    return np.minimum(EXCESS_PER_M * float(np.median(slack_m)) * slack_m, LARGEST_EXCESS_M)
 
 
 def spread_to_neighbours(
