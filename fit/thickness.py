@@ -22,8 +22,8 @@ from fit.settings import ThicknessSettings
 
 #: Thickness over movement (both along the normal) of the cloth that lies over a bone, by SMPL joint. Cloth is
 #: held at shoulders and collar, and there moves nearly as far as it stands away; at the waist and over the
-#: seat, where a shirt hangs over trousers, two layers add up while their movements do not. Means over four
-#: foreign and eight own sequences from none to baggy, of single values between 2 and 6.
+#: seat, where a shirt hangs over trousers, two layers add up while their movements do not. Between what four
+#: foreign and nine own sequences ask for, hulls and scans, single values from 2 to 6.
 _PER_MOVEMENT = {
     "pelvis": 4.3, "spine1": 3.8, "spine2": 3.1, "spine3": 3.3, "neck": 2.5, "head": 2.5, "collar": 2.7,
     "shoulder": 2.4, "elbow": 2.5, "wrist": 2.5, "hand": 2.5, "hip": 3.4, "knee": 2.9, "ankle": 2.9,
