@@ -109,10 +109,16 @@ def expected_thickness(
     return Thickness(expected, tolerance, movement)
 
 
-def undressed(thickness: Thickness, bare: Float[np.ndarray, "v"], settings: ThicknessSettings) -> Thickness:
-    """The clothes' thickness where a share (V) of the surface is known to be bare: there is none on it."""
+def undressed(
+    thickness: Thickness,
+    bare: Float[np.ndarray, "v"],
+    settings: ThicknessSettings,
+    excess: Float[np.ndarray, "v"] | float = 0.0,
+) -> Thickness:
+    """The clothes' thickness where a share (V) of the surface is known to be bare: there is none on it, and
+    only what was measured stands off (excess, m, as in `expected_thickness`)."""
     return replace(
         thickness,
-        expected=(1.0 - bare) * thickness.expected,
+        expected=(1.0 - bare) * thickness.expected + bare * settings.excess_shares[0] * excess,
         tolerance=(1.0 - bare) * thickness.tolerance + bare * settings.tolerance_m,
     )

@@ -204,7 +204,7 @@ def _round(
         thickness = expected_thickness(
             offsets, noise, cloth.ratio, model.faces, settings.thickness, cloth.excess, lost
         )
-        thickness = undressed(thickness, cloth.bare, settings.thickness)
+        thickness = undressed(thickness, cloth.bare, settings.thickness, cloth.excess)
     n_betas = 0 if held is not None else model.n_betas
     shape_prior = weights.shape_prior * len(chosen)
     reduced, pull = shape_prior * np.eye(n_betas), -shape_prior * at.betas[:n_betas]

@@ -5,7 +5,9 @@ import numpy as np
 from capture.layouts import dome_layout
 from fit.align import Alignment
 from fit.hull_excess import hull_excess
+from fit.settings import FitSettings
 from fit.state import BodyState
+from fit.thickness import Thickness, undressed
 from hull.scan import Scan
 from hull.slack import EXCESS_PER_M, LARGEST_EXCESS_M, expected_excess
 from hull.visual_hull import build_hull
@@ -47,3 +49,13 @@ def test_over_the_body_only_hulls_have_any():
     found = hull_excess(fitter(), hulls, alignments)
     assert found is not None
     np.testing.assert_allclose(found, 0.002, atol=1e-12)
+
+
+def test_skin_that_is_known_stands_off_as_hulls_do_and_carries_no_cloth():
+    thickness = Thickness(np.full(3, 0.02), np.full(3, 0.01), np.full(3, 0.005))
+    settings = FitSettings().thickness
+    bare = np.array([0.0, 0.5, 1.0])
+    on_scans = undressed(thickness, bare, settings).expected
+    np.testing.assert_allclose(on_scans, [0.02, 0.01, 0.0])
+    on_hulls = undressed(thickness, bare, settings, np.full(3, 0.004)).expected
+    np.testing.assert_allclose(on_hulls - on_scans, bare * settings.excess_shares[0] * 0.004)
