@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from capture.calibration_file import Calibration, read_calibration
+from capture.calibration_file import Calibration, find_calibrations, read_calibration
 from capture.errors import RecordingError
+from capture.formats.inria import list_matrix_files
 from capture.frame_choice import choose_frames
 from capture.image_sequence import ImageSequence, choose_sequence, find_images, find_inverted
 from capture.rig import Rig
@@ -110,7 +111,7 @@ def open_recording(
     plates.
 
     sequence : which sequence, where the folder has several.
-    calibration : a folder of camNN.txt, a Qualisys .qca.txt or a rig .json, instead of the recording's own.
+    calibration : a file or folder in any format of `capture.rig_formats`, instead of the recording's own.
     frames : "START:STOP:STEP" over frame numbers.
     units, up : "auto", or the calibration's unit (m, cm, mm) and the world's up axis (x, y, z, -x, -y, -z).
     background : folder of background plates (videos only).
@@ -169,7 +170,7 @@ def _open_images(
             root, sequence = parent, root.resolve().name
     name, folder = choose_sequence(root, sequence)
     images = find_images(name, folder)
-    calibration_path = calibration_path or root / "setup"
+    calibration_path = calibration_path or _own_calibration(root)
     calibration = read_calibration(calibration_path, images.sizes)
     inverted = find_inverted(images)
     probe = ImageSequence(images, calibration.rig, inverted)
@@ -192,6 +193,24 @@ def _open_images(
     notes += _gap_notes(probe, chosen)
     delivered = calibration.rig.with_world_scaled(world.metres_per_unit)
     return _recording(name, calibration, world, chosen, notes, ImageSequence(images, delivered, inverted))
+
+
+def _own_calibration(root: Path) -> Path:
+    """`setup/`, or the one calibration that lies there, in `calibration/` or beside them.
+
+    A JSON file beside them must be called rig.json: other programs leave theirs there too.
+    """
+    if (root / "setup").is_dir() and list_matrix_files(root / "setup"):
+        return root / "setup"
+    found = [
+        path
+        for path in find_calibrations(root)
+        if path.parent != root or path.suffix != ".json" or path.name == "rig.json"
+    ]
+    if len(found) > 1:
+        names = ", ".join(str(path.relative_to(root)) for path in found)
+        raise RecordingError(f"{root}: several calibrations ({names}); choose one with --calibration FILE")
+    return found[0] if found else root / "setup"
 
 
 def _recording(

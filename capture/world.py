@@ -132,13 +132,11 @@ def _check_facing(
 ) -> None:
     """Raise where cameras have the subject behind them: mirrored matrices, or poses given the wrong way
     round."""
-    if not _is_plausible(rig, subject, miss):
-        inverted = Rig(tuple(_inverted(camera) for camera in rig))
-        if _is_plausible(inverted, *find_subject(inverted, masks)):
-            raise RecordingError(
-                f"{where}: the poses look inverted (camera-to-world given where world-to-camera is due): "
-                "the cameras see the subject from around it only with every pose inverted; invert them"
-            )
+    if not _is_plausible(rig, subject, miss) and poses_look_inverted(rig, masks):
+        raise RecordingError(
+            f"{where}: the poses look inverted (camera-to-world given where world-to-camera is due): "
+            "the cameras see the subject from around it only with every pose inverted; invert them"
+        )
     behind = _behind(rig, subject)
     if not behind:
         return
@@ -158,6 +156,14 @@ def _check_facing(
         f"{where}: {len(behind)} of {len(rig)} cameras have the subject behind them ({names}): "
         f"their calibration is {kind}; calibrate them again or leave them out"
     )
+
+
+def poses_look_inverted(rig: Rig, masks: Masks | None = None) -> bool:
+    """True where the cameras stand round a subject only with every pose inverted."""
+    if _is_plausible(rig, *find_subject(rig, masks)):
+        return False
+    inverted = Rig(tuple(_inverted(camera) for camera in rig))
+    return _is_plausible(inverted, *find_subject(inverted, masks))
 
 
 def _is_plausible(rig: Rig, subject: Float[np.ndarray, " 3"], miss: float) -> bool:
