@@ -28,12 +28,14 @@ class Calibration:
     unit : "m", "cm", "mm", or None where the format does not say.
     files : what was read.
     notes : sentences on cameras that were left out, and on what looks odd.
+    leaves_open : whether the format leaves open how pixels are counted (3x4 matrices).
     """
 
     rig: Rig
     unit: str | None
     files: tuple[Path, ...]
     notes: tuple[str, ...]
+    leaves_open: bool = False
 
 
 def find_calibrations(root: Path) -> list[Path]:
@@ -116,7 +118,7 @@ def _read_matrix_folder(folder: Path, sizes: Mapping[str, tuple[int, int]]) -> C
         cameras.append(read_inria_camera(file, name, size))
         used[name] = file
     spare = [file.name for file in files.values() if file not in used.values()]
-    return Calibration(Rig(tuple(cameras)), None, tuple(used.values()), _spare_note(folder, spare))
+    return Calibration(Rig(tuple(cameras)), None, tuple(used.values()), _spare_note(folder, spare), True)
 
 
 def _paired(foreign: ForeignRig, path: Path, sizes: Mapping[str, tuple[int, int]]) -> Calibration:

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from capture.calibration_file import Calibration, find_calibrations, read_calibration
+from capture.convention import settle_convention
 from capture.errors import RecordingError
 from capture.formats.inria import list_matrix_files
 from capture.frame_choice import choose_frames
@@ -175,10 +176,16 @@ def _open_images(
     inverted = find_inverted(images)
     probe = ImageSequence(images, calibration.rig, inverted)
     chosen = choose_frames(probe.frame_ids, frames)
-    first = max(
+    probed = sorted(
         (probe.silhouettes(frame) for frame in sorted({chosen[0], chosen[len(chosen) // 2]})),
-        key=lambda found: sum(image is not None for image in found.images),
+        key=lambda found: -sum(image is not None for image in found.images),
     )
+    first = probed[0]
+    told: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+    if calibration.leaves_open:
+        pixels = settle_convention(calibration.rig, [found.images for found in probed])
+        calibration, doubts, told = replace(calibration, rig=pixels.rig), pixels.doubts, pixels.settled
     world = settle_world(
         calibration.rig,
         first.images,
@@ -187,7 +194,8 @@ def _open_images(
         up=up,
         where=str(calibration_path),
     )
-    notes = list(calibration.notes)
+    world = replace(world, notes=(*world.notes, *told), settled=(*world.settled, *told))
+    notes = [*calibration.notes, *doubts]
     if inverted:
         notes.append(f"Silhouettes are black on white, swapped on reading: {', '.join(sorted(inverted))}.")
     notes += _gap_notes(probe, chosen)

@@ -22,7 +22,8 @@ def require_pinholes(rig: Rig, holder: str) -> None:
     if bent:
         raise RecordingError(
             f"no lens distortion fits into {holder}, but {_listed(bent)} of {len(rig)} have one; "
-            "--undistorted writes the cameras of undistorted pictures; opencv, easymocap and colmap hold the lens"
+            "--undistorted writes the cameras of undistorted pictures; opencv, easymocap and colmap hold "
+            "the lens"
         )
 
 

@@ -79,8 +79,8 @@ def write_vicon(rig: Rig, path: Path) -> list[str]:
         radial, error_px = vicon_from_opencv(camera)
         if error_px > MOST_LENS_ERROR_PX:
             raise RecordingError(
-                f"Vicon's .xcp has three radial lens terms, which miss the lens of camera {camera.name} by up "
-                f"to {error_px:.2g} px; --undistorted writes the cameras of undistorted pictures, opencv and "
+                f"Vicon's .xcp has three radial lens terms, which miss the lens of camera {camera.name} by "
+                f"up to {error_px:.2g} px; --undistorted writes the cameras of undistorted pictures, opencv and "
                 "colmap hold the lens"
             )
         worst = max(worst, error_px)
