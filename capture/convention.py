@@ -126,12 +126,10 @@ def settle_convention(rig: Rig, frames: Sequence[Masks]) -> Settled:
         if abs(value - 0.5) < _NEAR_PX and error < _MOST_ERROR_PX:
             found = replace(found, first_px=0.5)
             settled.append(f"Pixel centres of the matrices: at 0.5 ({told}); they were converted.")
-        elif abs(value) < _NEAR_PX and error < _MOST_ERROR_PX:
-            settled.append(f"Pixel centres of the matrices: at whole numbers ({told}).")
-        elif len(best.depths) >= _ENOUGH:
-            doubts.append(
-                f"Pixel centres of the matrices: taken at whole numbers, but that is not sure ({told})."
-            )
+        elif len(best.depths) >= _ENOUGH:  # fewer cameras are not expected to tell
+            sure = abs(value) < _NEAR_PX and error < _MOST_ERROR_PX
+            text = "at whole numbers" if sure else "taken at whole numbers, though that is not sure"
+            (settled if sure else doubts).append(f"Pixel centres of the matrices: {text} ({told}).")
     return Settled(found.applied(rig), found, tuple(doubts), tuple(settled))
 
 

@@ -115,14 +115,14 @@ def given_camera(
     place: Path,
     name: str,
     size: Size | None,
-    intrinsics: np.ndarray,
-    rotation: np.ndarray,
-    translation: np.ndarray,
-    distortion: np.ndarray | Sequence[float] = (),
+    intrinsics: object,
+    rotation: object,
+    translation: object,
+    distortion: object = (),
 ) -> GivenCamera:
     """A camera after the checks that every format needs.
 
-    intrinsics (3 3) px, OpenCV's pixels; rotation: world to camera, (3 3) or a Rodrigues vector (3), rad;
+    Lists or arrays, not yet looked at: intrinsics (3 3) px, OpenCV's pixels; rotation: world to camera, (3 3) or a Rodrigues vector (3), rad;
     translation (3), world units; distortion in OpenCV's order, all zero meaning a pinhole. Raises
     RecordingError that names the file and the camera.
     """
@@ -130,8 +130,9 @@ def given_camera(
     matrix = _numbers(where, "camera matrix", intrinsics, (3, 3))
     lens = _lens(where, _numbers(where, "distortion", distortion, None))
     pose = np.eye(4)
-    pose[:3, :3] = _rotation(where, np.asarray(rotation, dtype=np.float64))
-    pose[:3, 3] = _numbers(where, "translation", np.ravel(translation), (3,))
+    pose[:3, :3] = _rotation(where, rotation)
+    moved = _numbers(where, "translation", translation, None)
+    pose[:3, 3] = _numbers(where, "translation", moved, (3,))
     if size is not None and min(size) < 1:
         raise RecordingError(f"{where}: picture size {size[0]}x{size[1]} px is not positive")
     if abs(matrix[2, 2]) < 1e-12 or np.abs(matrix[2, :2]).max() > 1e-9 * abs(matrix[2, 2]):
@@ -186,9 +187,10 @@ def _numbers(where: str, what: str, values: object, shape: tuple[int, ...] | Non
     return array
 
 
-def _rotation(where: str, given: np.ndarray) -> Float[np.ndarray, "3 3"]:
-    if given.size == 3:
-        return cv2.Rodrigues(_numbers(where, "rotation", given.ravel(), (3,)))[0]
+def _rotation(where: str, given: object) -> Float[np.ndarray, "3 3"]:
+    flat = _numbers(where, "rotation", given, None)
+    if flat.size == 3:
+        return cv2.Rodrigues(flat)[0]
     matrix = _numbers(where, "rotation", given, (3, 3))
     if np.abs(matrix @ matrix.T - np.eye(3)).max() > _ROUNDED:
         raise RecordingError(
@@ -204,7 +206,7 @@ def _rotation(where: str, given: np.ndarray) -> Float[np.ndarray, "3 3"]:
     return left @ right  # the nearest rotation: text with few digits is none exactly
 
 
-def _lens(where: str, values: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
+def _lens(where: str, values: Float[np.ndarray, "_given"]) -> Float[np.ndarray, "_kept"]:
     """Without zeros at the end, in one of the lengths that Camera takes."""
     n_used = int(np.flatnonzero(values)[-1]) + 1 if values.any() else 0
     if n_used == 0:

@@ -61,15 +61,12 @@ def read_easymocap(folder: Path) -> ForeignRig:
                 f"{extri_path}: camera {name} is calibrated in {intri_path.name}, but {missing} is missing "
                 "here; is the file whole?"
             )
-        rotation = np.asarray(turned if vector is None else np.ravel(vector), dtype=np.float64)
-        if vector is not None and turned is not None:
-            notes += _disagreement(f"{extri_path}: camera {name}", rotation, np.asarray(turned))
+        rotation = turned if vector is None else vector
+        notes += _disagreement(f"{extri_path}: camera {name}", vector, turned)
         height, width = intri.get(f"H_{name}"), intri.get(f"W_{name}")
         known = height is not None and width is not None and float(height) > 0 and float(width) > 0
         size = picture_size(where, width, height) if known else _size_beside(folder, name)
-        cameras.append(
-            given_camera(intri_path, name, size, matrix, rotation, np.ravel(translation), np.ravel(lens))
-        )
+        cameras.append(given_camera(intri_path, name, size, matrix, rotation, translation, lens))
     return foreign_rig(cameras, "m", [intri_path, extri_path], notes)
 
 
@@ -116,10 +113,12 @@ def _as_keyed(name: str, content: dict[str, Any], prefixes: tuple[str, ...] = ("
     return alike.pop() if len(alike) == 1 else name
 
 
-def _disagreement(where: str, vector: np.ndarray, matrix: np.ndarray) -> list[str]:
-    if vector.shape != (3,) or matrix.shape != (3, 3) or not np.isfinite(vector).all():
+def _disagreement(where: str, vector: Any, matrix: Any) -> list[str]:
+    if not isinstance(vector, np.ndarray) or not isinstance(matrix, np.ndarray):
         return []
-    off = float(np.abs(cv2.Rodrigues(vector)[0] - matrix).max())
+    if vector.size != 3 or matrix.shape != (3, 3) or not np.isfinite(vector).all():
+        return []
+    off = float(np.abs(cv2.Rodrigues(vector.ravel())[0] - matrix).max())
     return [f"{where}: R_ and Rot_ differ by {off:.2g}; R_ is used, as EasyMocap does."] if off > 1e-4 else []
 
 

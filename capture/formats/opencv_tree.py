@@ -68,11 +68,16 @@ def _with_matrices(value: Any, path: Path) -> Any:
 
 
 def _matrix(value: dict[str, Any], path: Path) -> Any:
-    if not {"rows", "cols", "data"} <= set(value):
+    if {"rows", "cols", "data"} <= set(value):
+        shape = [value["rows"], value["cols"]]
+    elif {"sizes", "data"} <= set(value):  # OpenCV 5 of arrays that are no matrices
+        shape = list(np.ravel(value["sizes"]))
+    else:
         return value
     try:
-        return np.array(value["data"], dtype=np.float64).reshape(int(value["rows"]), int(value["cols"]))
+        return np.array(value["data"], dtype=np.float64).reshape([int(n) for n in shape])
     except (TypeError, ValueError) as error:
+        told = " x ".join(map(str, shape))
         raise RecordingError(
-            f"{path}: a matrix of {value['rows']} x {value['cols']} does not hold that many numbers ({error})"
+            f"{path}: a matrix of {told} does not hold that many numbers ({error}); is the file whole?"
         ) from error

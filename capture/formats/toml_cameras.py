@@ -75,9 +75,9 @@ def read_toml_cameras(path: Path) -> ForeignRig:
                 name,
                 size,
                 table["matrix"],
-                np.asarray(_floats(where, table["rotation"])),
-                np.asarray(_floats(where, table["translation"])),
-                np.ravel(_floats(where, table.get("distortions") or [])),
+                table["rotation"],
+                table["translation"],
+                table.get("distortions") or [],
             )
         )
     notes = []
@@ -159,13 +159,6 @@ def _kind(content: dict[str, Any], tables: dict[str, dict[str, Any]]) -> str:
 
 def _absent(value: object) -> bool:
     return value is None or value == "null" or value == [] or value == ""
-
-
-def _floats(where: str, values: Any) -> Any:
-    try:
-        return np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise RecordingError(f"{where}: {values!r} is not made of numbers") from error
 
 
 def _numbers(camera: Camera, n_terms: int) -> str:

@@ -35,7 +35,7 @@ from capture.rig import Rig
 
 UNIT = "mm"
 #: A lens whose two descriptions differ by more than this is not written.
-MOST_LENS_ERROR_PX = 0.01
+MOST_LENS_ERROR_PX = 0.05
 
 
 def read_vicon(path: Path) -> ForeignRig:
@@ -80,8 +80,8 @@ def write_vicon(rig: Rig, path: Path) -> list[str]:
         if error_px > MOST_LENS_ERROR_PX:
             raise RecordingError(
                 f"Vicon's .xcp has three radial lens terms, which miss the lens of camera {camera.name} by "
-                f"up to {error_px:.2g} px; --undistorted writes the cameras of undistorted pictures, opencv and "
-                "colmap hold the lens"
+                f"up to {error_px:.2g} px; --undistorted writes the cameras of undistorted pictures, opencv "
+                "and colmap hold the lens"
             )
         worst = max(worst, error_px)
         device = camera.name if camera.name.isdigit() else str(number)

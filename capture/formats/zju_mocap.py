@@ -46,9 +46,9 @@ def read_zju_mocap(path: Path) -> ForeignRig:
                 name,
                 png_size(picture) if picture is not None and picture.is_file() else None,
                 lists["K"][k],
-                np.asarray(lists["R"][k]),
-                np.ravel(lists["T"][k]),
-                np.ravel(lists["D"][k]) if "D" in lists else (),
+                lists["R"][k],
+                lists["T"][k],
+                lists["D"][k] if "D" in lists else (),
             )
         )
     return foreign_rig(cameras, UNIT, [path])
