@@ -64,12 +64,18 @@ def perform_convert(command: Convert) -> int:
     from capture.rig_formats import METRES_PER_UNIT, detect_format, read_rig_of, write_rig
 
     foreign = read_rig_of(command.source)
-    notes = list(foreign.notes)
-    rig = _sized(command, foreign, None if command.size is None else parsed_size(command.size))
-    if command.invert_poses:
-        rig = with_inverted_poses(rig)
-    unit, unit_notes = _unit(command, foreign, rig)
-    notes += unit_notes + lens_doubts(rig) + placement_doubts(rig, METRES_PER_UNIT[unit])
+    size = None if command.size is None else parsed_size(command.size)
+    read_as = detect_format(command.source)
+    seen, notes = (None, []) if read_as != "inria" else _by_silhouettes(command)
+    if seen is not None and seen.names == foreign.names and size is None and not command.invert_poses:
+        rig, unit = seen, "m"
+    else:
+        rig = _sized(command, foreign, size)
+        if command.invert_poses:
+            rig = with_inverted_poses(rig)
+        unit, unit_notes = _unit(command, foreign, rig)
+        notes = [*notes, *unit_notes] if seen is None else unit_notes
+    notes += [*foreign.notes, *lens_doubts(rig), *placement_doubts(rig, METRES_PER_UNIT[unit])]
     if command.undistorted:
         if all(camera.is_pinhole for camera in rig):
             notes.append("No camera has lens distortion: --undistorted changes nothing.")
@@ -79,11 +85,31 @@ def perform_convert(command: Convert) -> int:
     )
     for note in [*notes, *lost]:
         print(f"bodyhull: note: {note}", file=sys.stderr)
-    read_as = detect_format(command.source)
     print(f"{len(rig)} cameras from {command.source} ({read_as}) as {command.to}:")
     for file in files:
         print(f"  {file}")
     return OK
+
+
+def _by_silhouettes(command: Convert) -> tuple[Rig | None, list[str]]:
+    """Cameras of 3x4 matrices in metres as the recording that they belong to would have them, with what its
+    silhouettes tell about unit and pixels; None where no recording lies round them or it cannot be opened."""
+    from capture.errors import RecordingError
+    from capture.image_sequence import find_sequences
+    from capture.recording import open_recording
+
+    source = command.source if command.source.is_dir() else command.source.parent
+    for root in (source, source.resolve().parent):
+        sequences = find_sequences(root) if root.is_dir() else {}
+        if not sequences:
+            continue
+        try:
+            opened = open_recording(root, sequence=next(iter(sequences)), units=command.units)
+        except RecordingError as error:
+            return None, [f"The silhouettes beside the matrices were not used: {error}"]
+        told = [note for note in opened.notes if note.startswith(("Unit", "Pixel", "The matrices", "With"))]
+        return opened.calibration, told
+    return None, []
 
 
 def _sized(command: Convert, foreign: ForeignRig, size: Size | None) -> Rig:

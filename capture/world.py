@@ -59,7 +59,7 @@ def settle_world(
     doubts: list[str] = []
     settled: list[str] = []
     subject, miss = find_subject(rig, masks)
-    _check_facing(rig, masks, subject, miss, where)
+    _check_facing(rig, masks, subject, where)
     distance = float(np.median(np.linalg.norm(rig.centres - subject, axis=1)))
     if masks is not None and miss > 0.08 * distance:
         doubts.append(
@@ -127,12 +127,10 @@ def _middle(mask: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, " 2"]:
     )
 
 
-def _check_facing(
-    rig: Rig, masks: Masks | None, subject: Float[np.ndarray, " 3"], miss: float, where: str
-) -> None:
+def _check_facing(rig: Rig, masks: Masks | None, subject: Float[np.ndarray, " 3"], where: str) -> None:
     """Raise where cameras have the subject behind them: mirrored matrices, or poses given the wrong way
     round."""
-    if not _is_plausible(rig, subject, miss) and poses_look_inverted(rig, masks):
+    if poses_look_inverted(rig, masks):
         raise RecordingError(
             f"{where}: the poses look inverted (camera-to-world given where world-to-camera is due): "
             "the cameras see the subject from around it only with every pose inverted; invert them"
@@ -160,18 +158,22 @@ def _check_facing(
 
 def poses_look_inverted(rig: Rig, masks: Masks | None = None) -> bool:
     """True where the cameras stand round a subject only with every pose inverted."""
-    if _is_plausible(rig, *find_subject(rig, masks)):
-        return False
+    if _stand_round(rig, *find_subject(rig, masks)):
+        return False  # inverted ones stand in one place; these are sound, or mirrored
     inverted = Rig(tuple(_inverted(camera) for camera in rig))
     return _is_plausible(inverted, *find_subject(inverted, masks))
 
 
 def _is_plausible(rig: Rig, subject: Float[np.ndarray, " 3"], miss: float) -> bool:
-    """Cameras around a subject: it is in front of all, their rays meet, and they do not stand in one
-    place."""
+    """Cameras around a subject, which is in front of all of them."""
+    return not _behind(rig, subject) and _stand_round(rig, subject, miss)
+
+
+def _stand_round(rig: Rig, subject: Float[np.ndarray, " 3"], miss: float) -> bool:
+    """Their rays meet, and they do not stand in one place."""
     distance = float(np.median(np.linalg.norm(rig.centres - subject, axis=1)))
     spread = float(np.linalg.norm(rig.centres - rig.centres.mean(axis=0), axis=1).max())
-    return not _behind(rig, subject) and miss < 0.08 * distance and (spread > 0.3 * distance or len(rig) < 2)
+    return miss < 0.08 * distance and (spread > 0.3 * distance or len(rig) < 2)
 
 
 def _behind(rig: Rig, subject: Float[np.ndarray, " 3"]) -> list[str]:
