@@ -19,6 +19,7 @@ from capture.world import find_subject, poses_look_inverted
 _LEAST_FIELD_DEG, _MOST_FIELD_DEG = 10.0, 120.0
 _MOST_OFF_MIDDLE = 0.2  # of the picture's size
 _NEAREST_M, _FARTHEST_M = 0.5, 15.0
+_SCATTERED_UP, _COMMON_UP = 0.5, 0.7  # length of the mean up direction
 
 
 def lens_doubts(rig: Rig) -> list[str]:
@@ -46,7 +47,7 @@ def placement_doubts(rig: Rig, metres_per_unit: float) -> list[str]:
     """Sentences on where the cameras stand, world units times `metres_per_unit` being metres."""
     if len(rig) < 2:
         return []
-    if poses_look_inverted(rig):
+    if poses_look_inverted(rig) or _upright_only_when_inverted(rig):
         return [
             "The poses look inverted (camera to world given where world to camera is due): the cameras stand "
             "round something only with every pose inverted; --invert-poses does that."
@@ -64,9 +65,21 @@ def placement_doubts(rig: Rig, metres_per_unit: float) -> list[str]:
     median = float(np.median(distances))
     if not _NEAREST_M <= median <= _FARTHEST_M:
         doubts.append(
-            f"The cameras stand {median:.3g} m from where they aim: check the unit (--units m, cm or mm)."
+            f"The cameras stand {median:.4g} m from where they aim: check the unit (--units m, cm or mm)."
         )
     return doubts
+
+
+def _upright_only_when_inverted(rig: Rig) -> bool:
+    """Inverted, cameras round a point near the origin all look at one point from close by; but their
+    pictures' up directions then point everywhere."""
+    inverted = with_inverted_poses(rig)
+    if not poses_look_inverted(inverted) and len(rig) > 2:
+        as_given, turned = (
+            float(np.linalg.norm(np.mean([c.up for c in r], axis=0))) for r in (rig, inverted)
+        )
+        return as_given < _SCATTERED_UP and turned > _COMMON_UP
+    return False
 
 
 def guess_unit(rig: Rig) -> tuple[str | None, float]:
