@@ -5,14 +5,16 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from capture.calibration_file import Calibration, read_calibration
+from capture.calibration_file import Calibration, find_calibrations, read_calibration
+from capture.convention import settle_convention
 from capture.errors import RecordingError
+from capture.formats.inria import list_matrix_files
 from capture.frame_choice import choose_frames
 from capture.image_sequence import ImageSequence, choose_sequence, find_images, find_inverted
 from capture.rig import Rig
@@ -110,7 +112,7 @@ def open_recording(
     plates.
 
     sequence : which sequence, where the folder has several.
-    calibration : a folder of camNN.txt, a Qualisys .qca.txt or a rig .json, instead of the recording's own.
+    calibration : a file or folder in any format of `capture.rig_formats`, instead of the recording's own.
     frames : "START:STOP:STEP" over frame numbers.
     units, up : "auto", or the calibration's unit (m, cm, mm) and the world's up axis (x, y, z, -x, -y, -z).
     background : folder of background plates (videos only).
@@ -169,15 +171,21 @@ def _open_images(
             root, sequence = parent, root.resolve().name
     name, folder = choose_sequence(root, sequence)
     images = find_images(name, folder)
-    calibration_path = calibration_path or root / "setup"
+    calibration_path = calibration_path or _own_calibration(root)
     calibration = read_calibration(calibration_path, images.sizes)
     inverted = find_inverted(images)
     probe = ImageSequence(images, calibration.rig, inverted)
     chosen = choose_frames(probe.frame_ids, frames)
-    first = max(
+    probed = sorted(
         (probe.silhouettes(frame) for frame in sorted({chosen[0], chosen[len(chosen) // 2]})),
-        key=lambda found: sum(image is not None for image in found.images),
+        key=lambda found: -sum(image is not None for image in found.images),
     )
+    first = probed[0]
+    told: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+    if calibration.leaves_open:
+        pixels = settle_convention(calibration.rig, [found.images for found in probed])
+        calibration, doubts, told = replace(calibration, rig=pixels.rig), pixels.doubts, pixels.settled
     world = settle_world(
         calibration.rig,
         first.images,
@@ -186,12 +194,31 @@ def _open_images(
         up=up,
         where=str(calibration_path),
     )
-    notes = list(calibration.notes)
+    world = replace(world, notes=(*world.notes, *told), settled=(*world.settled, *told))
+    notes = [*calibration.notes, *doubts]
     if inverted:
         notes.append(f"Silhouettes are black on white, swapped on reading: {', '.join(sorted(inverted))}.")
     notes += _gap_notes(probe, chosen)
     delivered = calibration.rig.with_world_scaled(world.metres_per_unit)
     return _recording(name, calibration, world, chosen, notes, ImageSequence(images, delivered, inverted))
+
+
+def _own_calibration(root: Path) -> Path:
+    """`setup/`, or the one calibration that lies there, in `calibration/` or beside them.
+
+    A JSON file beside them must be called rig.json: other programs leave theirs there too.
+    """
+    if (root / "setup").is_dir() and list_matrix_files(root / "setup"):
+        return root / "setup"
+    found = [
+        path
+        for path in find_calibrations(root)
+        if path.parent != root or path.suffix != ".json" or path.name == "rig.json"
+    ]
+    if len(found) > 1:
+        names = ", ".join(str(path.relative_to(root)) for path in found)
+        raise RecordingError(f"{root}: several calibrations ({names}); choose one with --calibration FILE")
+    return found[0] if found else root / "setup"
 
 
 def _recording(

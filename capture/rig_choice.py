@@ -12,11 +12,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from capture.calibration_file import read_rig_file
 from capture.camera import Camera
 from capture.errors import RecordingError
-from capture.formats.inria import list_matrix_files, read_inria_camera
 from capture.rig import Rig
+from capture.rig_formats import detect_format, read_rig_of
 from capture.world import find_subject, settle_world
 
 # The cameras' axes meet at about the height of a person's waist.
@@ -26,23 +25,17 @@ _AIM_HEIGHT_M = 1.0
 def read_rig(path: Path, size: tuple[int, int] | None = None) -> tuple[Rig, str | None]:
     """Every camera of a calibration as a pinhole, and its unit ("m", "mm"; None: the format does not say).
 
-    `path`: a rig .json, a Qualisys .qca.txt, or a folder of camNN.txt, which need the pictures' `size`
-    (width, height) px. Raises RecordingError for what cannot be read.
+    `path`: any format of `capture.rig_formats`; one without picture sizes (a folder of camNN.txt) needs
+    `size` (width, height) px. Raises RecordingError for what cannot be read.
     """
-    if not path.exists():
-        raise RecordingError(f"{path}: no such calibration")
-    if path.is_dir():
-        files = list_matrix_files(path)
-        if not files:
-            raise RecordingError(f"{path}: no camNN.txt in this folder")
-        if size is None:
-            raise RecordingError(
-                f"{path}: matrices do not say how large the pictures are; give --size, for example 2048x2048"
-            )
-        cameras = [read_inria_camera(file, f"cam-{number:03d}", size) for number, file in files.items()]
-        return Rig(tuple(cameras)), None
-    rig, unit = read_rig_file(path)
-    return rig.pinholes(), unit
+    foreign = read_rig_of(path)
+    without = [camera.name for camera in foreign.cameras if camera.size is None]
+    if without and size is None:
+        what = "matrices do" if detect_format(path) == "inria" else "this calibration does"
+        raise RecordingError(
+            f"{path}: {what} not say how large the pictures are; give --size, for example 2048x2048"
+        )
+    return foreign.rig(size).pinholes(), foreign.unit
 
 
 def stood_round_origin(rig: Rig, declared_unit: str | None, *, units: str = "auto", up: str = "auto") -> Rig:

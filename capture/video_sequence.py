@@ -2,7 +2,7 @@
 
     RECORDING/videos/<camera>.mp4
     RECORDING/background/<camera>.png                 the same view without the subject
-    RECORDING/[calibration/]*.qca.txt | *.json | setup/camNN.txt
+    RECORDING/[calibration/]*                          one calibration in any known format, or setup/camNN.txt
 
 Silhouettes are segmented when asked for, all cameras of a frame together; the backgrounds are made at the
 first one.
@@ -19,8 +19,10 @@ from jaxtyping import UInt8
 from tqdm import tqdm
 
 from capture.background import Backgrounds, build_backgrounds
+from capture.calibration_file import find_calibrations
 from capture.errors import RecordingError
 from capture.rig import Rig
+from capture.rig_formats import known_formats
 from capture.segmentation import segment
 from capture.silhouette_files import undistort_silhouette
 from capture.silhouettes import Silhouettes, sentence
@@ -48,15 +50,10 @@ def find_videos(root: Path) -> dict[str, VideoFile]:
 def find_calibration(root: Path) -> Path:
     """The recording's one calibration file or folder. Raises RecordingError for none, or for more than
     one."""
-    found = []
-    for folder in (root, root / "calibration"):
-        if folder.is_dir():
-            found += sorted([*folder.glob("*.qca.txt"), *folder.glob("*.qca"), *folder.glob("*.json")])
-            if (folder / "setup").is_dir():
-                found.append(folder / "setup")
+    found = find_calibrations(root)
     if not found:
         raise RecordingError(
-            f"{root}: no calibration here or in calibration/ (.qca.txt, rig .json or setup/); "
+            f"{root}: no calibration here or in calibration/ or setup/ (any of: {known_formats()}); "
             "give one with --calibration FILE"
         )
     if len(found) > 1:

@@ -15,6 +15,7 @@ from jaxtyping import Float, UInt8
 
 from capture.camera import Camera
 from capture.errors import RecordingError
+from capture.ray_agreement import coarse_evidence, covered_shares
 from capture.rig import Rig
 from capture.silhouette_files import PERSON
 
@@ -22,6 +23,7 @@ METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 UP_AXES = dict(zip(("x", "y", "z", "-x", "-y", "-z"), [*np.eye(3), *-np.eye(3)], strict=True))
 _PERSON_M = 1.7
 
+_MIRRORED, _N_ASKED = 0.75, 12
 _SURE_OF_UP_DEG = 20.0  # rigs that look down from a dome tilt their mean by less
 
 Masks = Sequence[UInt8[np.ndarray, "_h _w"] | None]
@@ -59,7 +61,7 @@ def settle_world(
     doubts: list[str] = []
     settled: list[str] = []
     subject, miss = find_subject(rig, masks)
-    _check_facing(rig, masks, subject, miss, where)
+    _check_facing(rig, masks, subject, where)
     distance = float(np.median(np.linalg.norm(rig.centres - subject, axis=1)))
     if masks is not None and miss > 0.08 * distance:
         doubts.append(
@@ -127,18 +129,15 @@ def _middle(mask: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, " 2"]:
     )
 
 
-def _check_facing(
-    rig: Rig, masks: Masks | None, subject: Float[np.ndarray, " 3"], miss: float, where: str
-) -> None:
+def _check_facing(rig: Rig, masks: Masks | None, subject: Float[np.ndarray, " 3"], where: str) -> None:
     """Raise where cameras have the subject behind them: mirrored matrices, or poses given the wrong way
     round."""
-    if not _is_plausible(rig, subject, miss):
-        inverted = Rig(tuple(_inverted(camera) for camera in rig))
-        if _is_plausible(inverted, *find_subject(inverted, masks)):
-            raise RecordingError(
-                f"{where}: the poses look inverted (camera-to-world given where world-to-camera is due): "
-                "the cameras see the subject from around it only with every pose inverted; invert them"
-            )
+    # A mirrored rig agrees with its silhouettes but for the sign of the depths, an inverted one does not.
+    if poses_look_inverted(rig, masks) and _agreement(rig, masks, subject) < _MIRRORED:
+        raise RecordingError(
+            f"{where}: the poses look inverted (camera-to-world given where world-to-camera is due): "
+            "the cameras see the subject from around it only with every pose inverted; invert them"
+        )
     behind = _behind(rig, subject)
     if not behind:
         return
@@ -158,6 +157,23 @@ def _check_facing(
         f"{where}: {len(behind)} of {len(rig)} cameras have the subject behind them ({names}): "
         f"their calibration is {kind}; calibrate them again or leave them out"
     )
+
+
+def _agreement(rig: Rig, masks: Masks | None, subject: Float[np.ndarray, " 3"]) -> float:
+    """Mean share of the silhouettes that the others' hull covers; 0 without silhouettes."""
+    extent = None if masks is None else subject_extent(rig, masks, subject)
+    if masks is None or extent is None:
+        return 0.0
+    evidence = coarse_evidence(masks, _N_ASKED)
+    return float(covered_shares(rig, evidence, subject, extent).mean())
+
+
+def poses_look_inverted(rig: Rig, masks: Masks | None = None) -> bool:
+    """True where the cameras stand round a subject only with every pose inverted."""
+    if _is_plausible(rig, *find_subject(rig, masks)):
+        return False
+    inverted = Rig(tuple(_inverted(camera) for camera in rig))
+    return _is_plausible(inverted, *find_subject(inverted, masks))
 
 
 def _is_plausible(rig: Rig, subject: Float[np.ndarray, " 3"], miss: float) -> bool:

@@ -16,7 +16,10 @@ from jaxtyping import Float
 
 from capture.camera import Camera
 from capture.errors import RecordingError
+from capture.foreign_rig import numbered_names
+from capture.formats.limits import number_text, require_pinholes
 from capture.projection_split import camera_from_projection
+from capture.rig import Rig
 
 _FILE = re.compile(r"^cam[-_]?(\d+)\.txt$", re.IGNORECASE)
 
@@ -36,6 +39,11 @@ def list_matrix_files(folder: Path) -> dict[int, Path]:
             )
         found[number] = path
     return found
+
+
+def is_matrix_file(path: Path) -> bool:
+    """Whether a file is called `camNN.txt`."""
+    return _FILE.match(path.name) is not None
 
 
 def read_projection_matrix(path: Path) -> Float[np.ndarray, "3 4"]:
@@ -79,3 +87,15 @@ def read_inria_camera(path: Path, name: str, size: tuple[int, int]) -> Camera:
         raise
     except ValueError as error:
         raise RecordingError(f"{path}: no projection matrix ({error})") from error
+
+
+def write_inria(rig: Rig, folder: Path) -> list[str]:
+    """`camNN.txt` each, metres, every number at full precision; the exact matrices of cameras that came as
+    such. Pinholes only."""
+    require_pinholes(rig, "INRIA's 3x4 matrices")
+    numbers = numbered_names(rig.names)
+    for number, camera in zip(numbers, rig, strict=True):
+        rows = (" ".join(number_text(value) for value in row) for row in camera.projection_matrix)
+        (folder / f"cam{number:02d}.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    listed = ", ".join(f"{name} is cam{n:02d}" for name, n in zip(rig.names, numbers, strict=True))
+    return [f"INRIA's matrices state neither picture sizes nor the unit: they are in metres. {listed}."]

@@ -1,4 +1,4 @@
-"""Qualisys camera calibrations: `.qca.txt` (XML).
+"""Qualisys camera calibrations, read and written: `.qca.txt` (XML).
 
 Conventions, as measured on a real recording: focal lengths and principal point in 1/64 pixel, pixel centres
 at whole numbers; `transform` x y z is the camera's centre in the world, in millimetres; the 3x3 read row by
@@ -15,6 +15,7 @@ import numpy as np
 
 from capture.camera import Camera
 from capture.errors import RecordingError
+from capture.formats.limits import number_text, require_terms
 from capture.rig import Rig
 
 _SUBPIXEL = 64.0
@@ -103,3 +104,55 @@ def _camera(path: Path, element: ElementTree.Element) -> Camera:
         return Camera(name, size, intrinsics, pose, distortion if distortion.any() else np.zeros(0))
     except ValueError as error:
         raise RecordingError(f"{path}: {error}") from error
+
+
+def write_qualisys(rig: Rig, path: Path) -> list[str]:
+    """A `.qca.txt` of a rig in metres: millimetres, 1/64 px, five lens terms."""
+    require_terms(rig, 5, "Qualisys' .qca.txt")
+    root = ElementTree.Element("calibration", {"type": "regular", "qtm-version": "none"})
+    ElementTree.SubElement(root, "results", {"std-dev": "0.0", "min-max-diff": "0.0"})
+    cameras = ElementTree.SubElement(root, "cameras")
+    for camera in rig:
+        element = ElementTree.SubElement(
+            cameras,
+            "camera",
+            {
+                "active": "1",
+                "avg-residual": "0.0",
+                "serial": camera.name,
+                "model": "none",
+                "viewrotation": "0",
+            },
+        )
+        view = {"left": 0, "top": 0, "right": camera.size[0] - 1, "bottom": camera.size[1] - 1}
+        for tag in ("fov_marker", "fov_marker_max", "fov_video", "fov_video_max"):
+            ElementTree.SubElement(element, tag, {key: str(value) for key, value in view.items()})
+        rotation = camera.camera_from_world[:3, :3]
+        rows = np.diag([1.0, -1, -1]) @ rotation
+        centre_mm = 1000.0 * (-rotation.T @ camera.camera_from_world[:3, 3])
+        place = {f"r{i + 1}{j + 1}": rows[i, j] for i in range(3) for j in range(3)}
+        place |= dict(zip("xyz", centre_mm, strict=True))
+        k = _SUBPIXEL * camera.intrinsics
+        lens = np.zeros(5)
+        lens[: camera.distortion[:5].size] = camera.distortion[:5]
+        inside = {
+            "focalLengthU": k[0, 0],
+            "focalLengthV": k[1, 1],
+            "centerPointU": k[0, 2],
+            "centerPointV": k[1, 2],
+            "skew": k[0, 1],
+            "radialDistortion1": lens[0],
+            "radialDistortion2": lens[1],
+            "radialDistortion3": lens[4],
+            "tangentalDistortion1": lens[2],
+            "tangentalDistortion2": lens[3],
+            "sensorMinU": 0.0,
+            "sensorMaxU": _SUBPIXEL * (camera.size[0] - 1),
+            "sensorMinV": 0.0,
+            "sensorMaxV": _SUBPIXEL * (camera.size[1] - 1),
+        }
+        for tag, values in (("transform", place), ("intrinsic", inside)):
+            ElementTree.SubElement(element, tag, {key: number_text(value) for key, value in values.items()})
+    ElementTree.indent(root)
+    ElementTree.ElementTree(root).write(path, encoding="ascii", xml_declaration=True)
+    return []
