@@ -14,6 +14,7 @@ import tyro
 
 import bodyhull
 from bodyhull.body_commands import Body, perform_body
+from bodyhull.calibrate_commands import Calibrate, perform_calibrate
 from bodyhull.config import FIT_OPTIONS, RunConfig, Units, Up
 from bodyhull.convert_commands import Convert, perform_convert
 from bodyhull.errors import ERROR, FRAMES_FAILED, OK, UserError
@@ -167,6 +168,7 @@ Command = (
     | Annotated[Body, tyro.conf.subcommand("body")]
     | Annotated[RigStudy, tyro.conf.subcommand("rig-study")]
     | Annotated[Convert, tyro.conf.subcommand("convert")]
+    | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
 )
@@ -269,6 +271,8 @@ def perform(command: object) -> int:
             return perform_rig_study(command)
         case Convert():
             return perform_convert(command)
+        case Calibrate():
+            return perform_calibrate(command)
         case Doctor():
             from bodyhull.doctor import findings, print_findings
 
