@@ -21,7 +21,7 @@ from capture.keypoint_files import read_keypoints
 from capture.rig import Rig
 from capture.silhouette_files import PERSON
 
-__all__ = ["choose_person", "read_keypoints", "triangulate_keypoints"]
+__all__ = ["choose_person", "chosen_detections", "read_keypoints", "triangulate_keypoints"]
 
 _LEAST_SCORE = 0.1
 _LEAST_JOINTS = 6
@@ -45,14 +45,7 @@ def triangulate_keypoints(
     The confidence is the mean score of the agreeing detections times their share among all detections of the
     joint.
     """
-    assert len(per_camera) == len(rig)
-    planes = [_on_plane(camera, people) for camera, people in zip(rig, per_camera, strict=True)]
-    if silhouettes is not None:
-        planes = [
-            _on_silhouette(camera, people, mask)
-            for camera, people, mask in zip(rig, planes, silhouettes, strict=True)
-        ]
-    chosen = choose_person(rig, planes)
+    planes, chosen = _choose(rig, per_camera, silhouettes)
     joints = np.full((N_JOINTS, 4), np.nan)
     joints[:, 3] = 0.0
     for joint_idx in range(N_JOINTS):
@@ -65,6 +58,43 @@ def triangulate_keypoints(
         if found is not None:
             joints[joint_idx] = found
     return joints
+
+
+def chosen_detections(
+    rig: Rig,
+    per_camera: Sequence[People],
+    silhouettes: Sequence[Silhouette | None] | None,
+) -> Float[np.ndarray, "c 25 3"]:
+    """The subject's detections in every camera (C 25 3): pixels of the camera's pinhole, and the score; 0
+    where there is none, or one not to be used.
+
+    Arguments as for `triangulate_keypoints`.
+    """
+    planes, chosen = _choose(rig, per_camera, silhouettes)
+    found = np.zeros((len(rig), N_JOINTS, 3))
+    for camera_idx, (camera, person_idx) in enumerate(zip(rig, chosen, strict=True)):
+        if person_idx is None:
+            continue
+        person = planes[camera_idx][person_idx]
+        homogeneous = np.column_stack([person[:, :2], np.ones(N_JOINTS)])
+        used = person[:, 2] >= _LEAST_SCORE
+        found[camera_idx, :, :2] = (homogeneous @ camera.intrinsics.T)[:, :2]
+        found[camera_idx, :, 2] = np.where(used, person[:, 2], 0.0)
+    return found
+
+
+def _choose(
+    rig: Rig, per_camera: Sequence[People], silhouettes: Sequence[Silhouette | None] | None
+) -> tuple[list[People], list[int | None]]:
+    """Detections on the plane z = 1, and which of each camera's people is the subject."""
+    assert len(per_camera) == len(rig)
+    planes = [_on_plane(camera, people) for camera, people in zip(rig, per_camera, strict=True)]
+    if silhouettes is not None:
+        planes = [
+            _on_silhouette(camera, people, mask)
+            for camera, people, mask in zip(rig, planes, silhouettes, strict=True)
+        ]
+    return planes, choose_person(rig, planes)
 
 
 def choose_person(rig: Rig, planes: Sequence[People]) -> list[int | None]:
