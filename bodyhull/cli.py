@@ -17,6 +17,7 @@ from bodyhull.body_commands import Body, perform_body
 from bodyhull.config import FIT_OPTIONS, RunConfig, Units, Up
 from bodyhull.errors import ERROR, FRAMES_FAILED, OK, UserError
 from bodyhull.folder import RunFolder
+from bodyhull.silhouette_commands import MakeSilhouettes, perform_silhouettes
 from bodyhull.study_commands import RigStudy, perform_rig_study
 
 if TYPE_CHECKING:
@@ -165,6 +166,7 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Body, tyro.conf.subcommand("body")]
     | Annotated[RigStudy, tyro.conf.subcommand("rig-study")]
+    | Annotated[MakeSilhouettes, tyro.conf.subcommand("silhouettes")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
 )
@@ -265,6 +267,8 @@ def perform(command: object) -> int:
             return perform_body(command)
         case RigStudy():
             return perform_rig_study(command)
+        case MakeSilhouettes():
+            return perform_silhouettes(command)
         case Doctor():
             from bodyhull.doctor import findings, print_findings
 

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from capture.difference import Box, coarse_of, full_size
+from capture.difference import Box, coarse_of, full_size, without_specks
 from capture.plate_difference import PlateDifference, PlateLook
 
 _LOW, _HIGH = 0.45, 0.7  # of the key's strength
@@ -57,7 +57,7 @@ class KeyDifference:
         found = _person(small, self.key)
         if other is not None and self.screen is not None:
             found = np.where(self.screen > 0, found, other.coarse)
-        coarse = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)).astype(np.uint8)
+        coarse = without_specks(found.astype(np.uint8))
         return KeyLook(self, picture, other, coarse, cv2.countNonZero(coarse) / coarse.size)
 
 

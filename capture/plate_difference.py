@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from capture.difference import Box, coarse_of, coarse_step, full_size
+from capture.difference import Box, coarse_of, coarse_step, full_size, without_specks
 from capture.plates import Plate
 
 _SPREADS = 4.0  # how many standard deviations are still the background
@@ -27,6 +27,7 @@ _SHADE_LOW, _SHADE_HIGH = 0.45, 0.985
 _SHADE_RESIDUE = 9  # levels that a channel may be off the plate's colour, dimmed
 _SHADE_BORDER = 0.35  # a shadow's rim touches the person by less
 _UNIT = 128  # of ratios kept as bytes
+_HALVED = (np.arange(256) // 2).astype(np.uint8)
 
 Picture = UInt8[np.ndarray, "_h _w 3"]
 
@@ -89,11 +90,11 @@ class PlateLook:
         even = small if levels is None else cv2.LUT(small, levels)
         differs = cv2.bitwise_not(cv2.inRange(even, low, high))
         changed = cv2.countNonZero(differs) / differs.size
-        differs = cv2.morphologyEx(differs, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)).astype(np.uint8)
+        differs = without_specks(differs.astype(np.uint8, copy=False))
         shade = None
         x, y, width, height = cv2.boundingRect(differs)
         if model.shadows and width > 0:
-            box = (slice(y, y + height), slice(x, x + width))
+            box = (slice(max(0, y - 2), y + height + 2), slice(max(0, x - 2), x + width + 2))
             looks_so = cv2.bitwise_and(_shaded(even[box], plate[box], grey[box]), differs[box])
             shadows = _true_shadows(differs[box], looks_so.astype(np.uint8))
             if cv2.countNonZero(shadows):
@@ -115,7 +116,23 @@ class PlateLook:
                 shaded = _shaded(picture[part], model.plate[box][part], model.grey[box][part])
                 shaded = cv2.bitwise_and(shaded, near[part])
                 differs[part] = cv2.subtract(differs[part], shaded)
-        return differs.astype(np.uint8, copy=False)
+        return _at_half_height(differs.astype(np.uint8, copy=False), picture, model.plate[box])
+
+
+def _at_half_height(
+    differs: UInt8[np.ndarray, "h w"], picture: Picture, plate: Picture
+) -> UInt8[np.ndarray, "h w"]:
+    """The mask without the rim where less than half of the picture is the person.
+
+    A threshold just above the noise takes in every pixel that the person touches; at the outline the
+    difference falls off over two or three pixels, and half of what it is just inside is the edge.
+    """
+    red, green, blue = cv2.split(cv2.absdiff(picture, plate))
+    height = cv2.max(cv2.max(red, green), blue)
+    half = cv2.LUT(cv2.dilate(height, np.ones((5, 5), np.uint8)), _HALVED)
+    rim = cv2.subtract(differs, cv2.erode(differs, np.ones((5, 5), np.uint8)))
+    low = cv2.compare(height, half, cv2.CMP_LT)
+    return cv2.subtract(differs, cv2.bitwise_and(low, rim)).astype(np.uint8)
 
 
 def light_gains(small: Picture, plate: Picture) -> Float[np.ndarray, "3"]:

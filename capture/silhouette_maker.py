@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 
 from capture.background import Backgrounds, build_backgrounds, median_over_time
 from capture.chroma_key import KeyDifference, find_key, key_of_colour
@@ -28,7 +28,7 @@ from capture.filmed import Filmed
 from capture.mask_border import refined
 from capture.mask_repair import MaskRepair
 from capture.mixture_difference import train
-from capture.plate_difference import PlateDifference, light_gains, light_table
+from capture.plate_difference import PlateDifference, PlateLook, light_gains, light_table
 from capture.plates import Plate, learn_plate, median_plate
 from capture.segmentation import segment
 from capture.silhouettes import sentence
@@ -43,6 +43,7 @@ _N_PATH, _N_TOLERANCE = 10, 3  # samples for the subject's path, and for what th
 _LIGHT_CHANGED = 0.6  # of the picture differs: no subject does that
 _LEAST_COARSE = 30  # px of the coarse look; less is no person
 _DRIFT_NOTICED = 0.03
+_MANY_EMPTY = 10  # empty frames that need no correction by the film
 _OUTLINE_SHARE = 1 / 40  # without a hull: how far around what differs the subject may reach
 
 Picture = UInt8[np.ndarray, "_h _w 3"]
@@ -141,6 +142,8 @@ class SilhouetteMaker:
             if picture is None or outline is None:
                 masks.append(None)
                 continue
+            look = self.differences[camera_idx].look(picture)
+            outline = _without_shadow(outline, look, self.differences[camera_idx].step)
             mask = segment(picture, self.cut.pictures[camera_idx], outline, self.cut.trusted[camera_idx])
             masks.append(self._refined(mask, picture))
         return masks, found
@@ -184,6 +187,7 @@ class SilhouetteMaker:
             disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
             everywhere = (slice(0, mask.shape[0]), slice(0, mask.shape[1]))
             outline = full_size(cv2.dilate(region, disc).astype(np.uint8), step, everywhere) > 0
+            outline = _without_shadow(outline, look, step)
             return self._refined(segment(picture, self.backgrounds[camera_idx], outline), picture)
         fine = look.fine(box)
         # What the coarse look kept, and a rim around it that is narrower than a gap to something else.
@@ -225,7 +229,11 @@ def prepare_maker(filmed: Filmed, options: MakerOptions, report: Report = lambda
         methods.append(used)
     several = filmed.rig is not None and len(filmed.rig) >= 2
     cut = None
-    if several and method == "auto" and methods.count("auto") * 2 > len(methods):
+    corrected = methods.count("auto") * 2 > len(methods) and not all(
+        plate.n_frames >= _MANY_EMPTY and camera in filmed.scenes
+        for camera, plate in zip(filmed.cameras, plates, strict=True)
+    )
+    if several and method == "auto" and corrected:
         assert filmed.rig is not None
         report("backgrounds from all cameras together")
         cut = build_backgrounds(
@@ -234,6 +242,7 @@ def prepare_maker(filmed: Filmed, options: MakerOptions, report: Report = lambda
             lambda camera_idx: filmed.frames.read_several(filmed.cameras[camera_idx], samples),
         )
         methods = ["auto"] * len(methods)
+        differences = [PlateDifference.of_plate(Plate(picture, None, 1)) for picture in cut.pictures]
     backgrounds = tuple(plate.mean for plate in plates) if cut is None else cut.pictures
     maker = SilhouetteMaker(
         filmed,
@@ -323,6 +332,15 @@ def _subject(maker: SilhouetteMaker, frames: list[int]) -> SubjectChoice:
             None if look is None or look.changed > _LIGHT_CHANGED else look.coarse for look in looks
         ]
     return SubjectChoice.build(maker.filmed.rig, coarse)
+
+
+def _without_shadow(outline: Bool[np.ndarray, "_h _w"], look: Look, step: int) -> Bool[np.ndarray, "_h _w"]:
+    """Where the subject can be, less what is plainly its shadow on the floor: the minimum cut would take a
+    dark shadow's grey for a colour that the person wears."""
+    if not isinstance(look, PlateLook) or look.shade is None:
+        return outline
+    everywhere = (slice(0, outline.shape[0]), slice(0, outline.shape[1]))
+    return outline & (full_size(look.shade, step, everywhere) == 0)
 
 
 def _is_empty(mask: Mask | None) -> bool:
