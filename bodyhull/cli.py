@@ -19,6 +19,7 @@ from bodyhull.config import FIT_OPTIONS, RunConfig, Units, Up
 from bodyhull.convert_commands import Convert, perform_convert
 from bodyhull.errors import ERROR, FRAMES_FAILED, OK, UserError
 from bodyhull.folder import RunFolder
+from bodyhull.silhouette_commands import MakeSilhouettes, perform_silhouettes
 from bodyhull.study_commands import RigStudy, perform_rig_study
 
 if TYPE_CHECKING:
@@ -169,6 +170,7 @@ Command = (
     | Annotated[RigStudy, tyro.conf.subcommand("rig-study")]
     | Annotated[Convert, tyro.conf.subcommand("convert")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
+    | Annotated[MakeSilhouettes, tyro.conf.subcommand("silhouettes")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
 )
@@ -273,6 +275,8 @@ def perform(command: object) -> int:
             return perform_convert(command)
         case Calibrate():
             return perform_calibrate(command)
+        case MakeSilhouettes():
+            return perform_silhouettes(command)
         case Doctor():
             from bodyhull.doctor import findings, print_findings
 

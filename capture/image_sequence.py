@@ -78,10 +78,10 @@ def choose_sequence(root: Path, wanted: str | None) -> tuple[str, Path]:
 
 def find_images(name: str, folder: Path) -> ImageFolders:
     """List a sequence's files. Raises RecordingError where no camera has a silhouette that can be opened."""
-    silhouettes = _camera_folders(folder / SILHOUETTES)
+    silhouettes = camera_folders(folder / SILHOUETTES)
     if not silhouettes:
         raise RecordingError(f"{folder / SILHOUETTES}: no cam-NNN folder with silh_NNNNNN.png files in it")
-    pictures = _camera_folders(folder / PICTURES) if (folder / PICTURES).is_dir() else {}
+    pictures = camera_folders(folder / PICTURES) if (folder / PICTURES).is_dir() else {}
     sizes: dict[str, tuple[int, int]] = {}
     for camera, files in silhouettes.items():
         size = _usual_size(files)
@@ -94,7 +94,9 @@ def find_images(name: str, folder: Path) -> ImageFolders:
     return ImageFolders(name, sizes, silhouettes, {name: pictures.get(name, {}) for name in silhouettes})
 
 
-def _camera_folders(folder: Path) -> dict[str, dict[int, Path]]:
+def camera_folders(folder: Path) -> dict[str, dict[int, Path]]:
+    """Camera folder's name -> frame number -> file, cameras in order of their numbers; empty folders left
+    out."""
     cameras = [path for path in folder.iterdir() if path.is_dir() and _CAMERA.match(path.name)]
     found: dict[str, dict[int, Path]] = {}
     for camera in sorted(cameras, key=lambda path: (int(re.sub(r"\D", "", path.name)), path.name)):

@@ -69,6 +69,24 @@ def read_silhouette(path: Path, *, inverted: bool = False, soft: bool = False) -
     return SilhouetteFile(mask, problem, looks_inverted=share > 0.5 and _border_share(mask) > 0.5)
 
 
+def write_silhouette(path: Path, mask: UInt8[np.ndarray, "h w"]) -> None:
+    """Write an 8-bit PNG; it appears whole or not at all. OSError where it cannot be written."""
+    done, data = cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    assert done
+    write_whole(path, data.tobytes())
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write under a temporary name beside `path`, then rename. OSError where it cannot be written."""
+    part = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(content)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
 def png_damage(content: bytes) -> str | None:
     """What is broken in a PNG's chain of chunks, or None. OpenCV hands out the upper part of a cut file
     silently."""
