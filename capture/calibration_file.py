@@ -19,6 +19,14 @@ from capture.formats.qualisys import read_qualisys
 from capture.rig import Rig
 
 
+class PictureSizeError(RecordingError):
+    """A camera that is calibrated for pictures of another size. camera : its name in the recording."""
+
+    def __init__(self, text: str, camera: str, calibrated: tuple[int, int]) -> None:
+        super().__init__(text)
+        self.camera, self.calibrated = camera, calibrated
+
+
 @dataclass(frozen=True)
 class Calibration:
     """What a calibration file says, for the cameras that have pictures.
@@ -102,9 +110,11 @@ def _paired(rig: Rig, unit: str, path: Path, sizes: Mapping[str, tuple[int, int]
                 f"(it has {', '.join(rig.names)})"
             )
         if camera.size != size:
-            raise RecordingError(
+            raise PictureSizeError(
                 f"{path}: camera {name} is calibrated for {camera.size[0]}x{camera.size[1]} px, "
-                f"its pictures are {size[0]}x{size[1]} px; use pictures of the calibrated size"
+                f"its pictures are {size[0]}x{size[1]} px; use pictures of the calibrated size",
+                name,
+                camera.size,
             )
         cameras.append(_renamed(camera, name))
         by_name.pop(camera.name, None)
