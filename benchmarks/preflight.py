@@ -25,6 +25,7 @@ import numpy as np
 
 from benchmarks.hull import machine
 from bodyhull.checking import Check, check_recording
+from capture.calibration_file import camera_number
 from capture.camera import Camera
 from capture.errors import RecordingError
 from capture.frame_facts import scaled_camera
@@ -265,7 +266,12 @@ def dead(scene: Scene, rng: np.random.Generator):  # type: ignore[no-untyped-def
     i, made = int(rng.integers(len(scene.rig))), scene.copy()
     shape = np.asarray(scene.masks[i][0]).shape
     way = rng.integers(4)
-    nothing = {0: np.zeros(shape, np.uint8), 1: None, 2: np.zeros((0, 0), np.uint8), 3: np.zeros(shape, np.uint8)}
+    nothing = {
+        0: np.zeros(shape, np.uint8),
+        1: None,
+        2: np.zeros((0, 0), np.uint8),
+        3: np.zeros(shape, np.uint8),
+    }
     first = scene.n_frames // 2 if way == 3 else 0
     for k in range(first, scene.n_frames):
         made.masks[i][k] = nothing[int(way)]
@@ -293,7 +299,7 @@ PLANTS: dict[str, Plant] = {
 def told_by(check: Check) -> list[tuple[str, frozenset[str] | None]]:
     """Kind and camera numbers of every finding; None: the whole rig."""
     return [
-        (f.kind.name.lower(), None if f.whole_rig else frozenset(n[-2:].lstrip("0") or "0" for n in f.cameras))
+        (f.kind.name.lower(), None if f.whole_rig else frozenset(str(camera_number(n)) for n in f.cameras))
         for f in check.findings
     ]
 
@@ -310,9 +316,7 @@ def run_trials(n: int, seed: int, only: list[str], verbose: bool) -> None:
                 continue
             rng = np.random.default_rng([seed + trial, number])
             made, kind, cameras = plant(scene, rng)
-            expected = (
-                [] if not kind else [(kind, None if cameras is None else frozenset(map(str, cameras)))]
-            )
+            expected = [] if not kind else [(kind, None if cameras is None else frozenset(map(str, cameras)))]
             with tempfile.TemporaryDirectory() as folder:
                 root = Path(folder) / "recording"
                 root.mkdir()
@@ -330,9 +334,9 @@ def run_trials(n: int, seed: int, only: list[str], verbose: bool) -> None:
             column = ", ".join(sorted({k for k, _ in told})) or "nothing"
             table[name][column if right or column == "nothing" else f"{column} (wrong)"] += 1
             if not right or verbose:
-                print(f"<!-- {seed + trial} {name}: expected {expected}, told {told}; {made.about}; json {made.as_json} -->", flush=True)
-                for line in lines:
-                    print(f"<!--     {line} -->", flush=True)
+                print(f"<!-- {seed + trial} {name}: expected {expected}, told {told}")
+                print(f"     {made.about}; {'rig.json' if made.as_json else 'matrices'}")
+                print(*(f"     {line}" for line in lines), "-->", sep="\n", flush=True)
     print(f"\n{n} recordings from seed {seed}; {np.mean(seconds):.1f} s processor time a check\n")
     print("| planted | named right | told |")
     print("| --- | --- | --- |")
@@ -360,14 +364,22 @@ def run_offsets(n: int, seed: int, verbose: bool) -> None:
             truth, found = those.get(i, 0), camera.offset_frames
             error = None if found is None else round(found) - truth
             if i in those:
-                result["untold" if error is None else "exact" if error == 0 else "off by one" if abs(error) == 1 else "wrong"] += 1
+                result[_judged(error)] += 1
             else:
                 alarms += error not in (None, 0)
             if verbose and error not in (None, 0):
                 print(f"<!-- {seed + trial} camera {i}: truth {truth}, found {found}; {scene.about} -->")
     total = sum(result.values())
-    print(f"\n{n} recordings from seed {seed}: of {total} cameras that are off by -10 to 10 frames (one to a "
-          f"third of the rig), {dict(result)}; of the others {alarms} are told to be off")
+    print(
+        f"\n{n} recordings from seed {seed}: of {total} cameras that are off by -10 to 10 frames (one to a "
+        f"third of the rig), {dict(result)}; of the others {alarms} are told to be off"
+    )
+
+
+def _judged(error: int | None) -> str:
+    if error is None:
+        return "cannot be told"
+    return "exact" if error == 0 else "off by one" if abs(error) == 1 else "wrong"
 
 
 def main() -> None:

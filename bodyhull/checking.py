@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from bodyhull.errors import UserError
 from capture.camera import Camera
 from capture.errors import RecordingError
 from capture.finding import Finding, FindingKind
-from capture.frame_facts import FrameFacts, frames_to_read, read_frame_facts, touches_border
+from capture.frame_facts import FrameFacts, frames_to_read, read_frame_facts
 from capture.preflight import Opened, open_for_check
 from capture.rig import Rig
 from capture.world import METRES_PER_UNIT, find_subject, settle_world, subject_extent
@@ -28,7 +28,7 @@ from hull.visual_hull import HullOptions, build_hull
 # and so many times the typical camera's, are not the silhouettes' doing.
 RESIDUAL_PX, RESIDUAL_SHARE, RESIDUAL_FACTOR = 6.0, 0.006, 2.5
 _N_FULL, _N_FULL_LARGE, _LARGE_MP = 4, 2, 100.0
-_VOXEL_M = 0.01
+_VOXEL_M = 0.015
 _PERSON_M = (0.6, 3.5)
 
 
@@ -145,13 +145,11 @@ def check_recording(
     )
     recording = opened.recording
     ids = frames_to_read(recording, opened.is_video, at_most)
-    facts = read_frame_facts(
-        recording, ids, None if report is None else lambda done: report(done, len(ids))
-    )
+    facts = read_frame_facts(recording, ids, None if report is None else lambda done: report(done, len(ids)))
     found = examine(facts)
     rig, per_unit, unit, unit_findings = _metric_rig(opened, facts, found)
     moments = _full_moments(opened, facts, found, rig)
-    axis, trouble = _world(opened, rig, found, facts, up)
+    axis, trouble = _world(opened, rig, found, up)
     numbers = _rig_numbers(opened, facts, found, rig, moments, unit, per_unit, axis)
     outside = residuals(moments, found.members) if found.members else {}
     cameras = _camera_numbers(facts, found, rig, outside, moments, axis, numbers)
@@ -160,7 +158,11 @@ def check_recording(
     if trouble is not None and not findings:
         findings.append(
             Finding(
-                FindingKind.UNREADABLE, rig.names, trouble, "see what `bodyhull run` says of it", whole_rig=True
+                FindingKind.UNREADABLE,
+                rig.names,
+                trouble,
+                "see what `bodyhull run` says of it",
+                whole_rig=True,
             )
         )
     return Check(
@@ -295,18 +297,12 @@ def _turned(image: np.ndarray, turn: str | None) -> np.ndarray:
     return np.ascontiguousarray(image[:: steps[0], :: steps[1]])
 
 
-def _world(
-    opened: Opened, rig: Rig, found: Examination, facts: FrameFacts, up: str
-) -> tuple[np.ndarray | None, str | None]:
-    """The up axis, and why a run would not start, both by the cameras that agree."""
-    good = [i for i in found.members] or list(range(len(rig)))
-    masks = None
-    if found.moments:
-        turn = None if found.rig_repair is None else found.rig_repair.turn
-        del turn
+def _world(opened: Opened, rig: Rig, found: Examination, up: str) -> tuple[np.ndarray | None, str | None]:
+    """The up axis by the cameras that agree, and why a run would refuse them all the same."""
+    good = found.members or tuple(range(len(rig)))
     try:
         world = settle_world(
-            Rig(tuple(rig[i] for i in good)), masks, declared_unit="m", up=up, where=opened.where
+            Rig(tuple(rig[i] for i in good)), None, declared_unit="m", up=up, where=opened.where
         )
     except RecordingError as error:
         return None, str(error)
@@ -392,7 +388,9 @@ def _camera_numbers(
                 None if fit is None else fit.missing,
                 None if fit is None else fit.surplus,
                 offset_frames,
-                *((float(f(area)) if len(area) else 0.0) for f in (np.mean, np.min, np.max)),
+                float(area.mean()) if len(area) else 0.0,
+                float(area.min()) if len(area) else 0.0,
+                float(area.max()) if len(area) else 0.0,
                 float(shown.mean()),
                 float(facts.border[i][shown].mean()) if shown.any() else 0.0,
             )
@@ -445,6 +443,3 @@ def _loose(
         for name in loose
         if told[name] > RESIDUAL_FACTOR * typical
     ]
-
-
-__all__ = ["CameraNumbers", "Check", "RigNumbers", "check_recording", "replace", "touches_border"]

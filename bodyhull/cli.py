@@ -14,6 +14,7 @@ import tyro
 
 import bodyhull
 from bodyhull.body_commands import Body, perform_body
+from bodyhull.check_commands import CheckRecording, perform_check
 from bodyhull.config import FIT_OPTIONS, RunConfig, Units, Up
 from bodyhull.errors import ERROR, FRAMES_FAILED, OK, UserError
 from bodyhull.folder import RunFolder
@@ -165,6 +166,7 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Body, tyro.conf.subcommand("body")]
     | Annotated[RigStudy, tyro.conf.subcommand("rig-study")]
+    | Annotated[CheckRecording, tyro.conf.subcommand("check")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
 )
@@ -265,6 +267,8 @@ def perform(command: object) -> int:
             return perform_body(command)
         case RigStudy():
             return perform_rig_study(command)
+        case CheckRecording():
+            return perform_check(command)
         case Doctor():
             from bodyhull.doctor import findings, print_findings
 

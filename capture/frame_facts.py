@@ -19,7 +19,7 @@ from capture.silhouette_files import PERSON, UNKNOWN
 # Small masks are about this wide: a person then is some hundred pixels tall, and fifty cameras fit in memory.
 _SMALL_PX = 448
 # What a check reads, in megapixels of silhouettes; lenses and segmentation cost so many times as much.
-_BUDGET_MP, _LENS_FACTOR, _VIDEO_FACTOR = 4000.0, 3.0, 12.0
+_BUDGET_MP, _LENS_FACTOR, _VIDEO_FACTOR = 4000.0, 3.0, 20.0
 _FEWEST_FRAMES, _MOST_FRAMES, _BLOCK_FRAMES = 9, 240, 60
 # The picture's border reaches so far in: what lies on it may go on beyond.
 _BORDER_PX = 2
@@ -36,7 +36,7 @@ class FrameFacts:
     shrink : (C,) how many of a picture's pixels go into one of the small mask's, each way.
     present : (C T) whether there is a silhouette with a person in it.
     area : (C T) the person's share of the picture; 0 where the camera shows nobody or has nothing.
-    changed : (C T) pixels that differ from the frame before, over the person's area; NaN without two pictures.
+    changed : (C T) pixels that differ from the frame before, over the person's area; NaN without both.
     border : (C T) whether the person touches the picture's border.
     problems : of reading, a sentence each.
     """
@@ -111,7 +111,8 @@ def read_frame_facts(
     n_cameras, n_frames = len(recording.rig), len(frame_ids)
     present, border = (np.zeros((n_cameras, n_frames), dtype=bool) for _ in range(2))
     area, changed = np.zeros((n_cameras, n_frames)), np.full((n_cameras, n_frames), np.nan)
-    packed, problems = {}, []
+    packed: dict[tuple[int, int], tuple[UInt8[np.ndarray, "_n"], UInt8[np.ndarray, "_m"] | None]] = {}
+    problems: list[str] = []
     before: list[UInt8[np.ndarray, "_h _w"] | None] = [None] * n_cameras
     for k, frame_id in enumerate(frame_ids):
         found = recording.silhouettes(frame_id)

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool
 
 from capture.camera import Camera
 from capture.finding import Finding, FindingKind
@@ -82,10 +83,12 @@ def examine(facts: FrameFacts) -> Examination:
     asked = [i for i in range(n_cameras) if any(moment.views[i] is not None for moment in moments)]
     findings: list[Finding] = []
     if not moments or len(asked) < 2:
-        trust = Trust((), 1.0, len(asked))
-        return Examination(tuple(_silent(facts, [], trust, [])), (), trust, {}, {}, (), None, ())
+        nobody = Trust((), 1.0, len(asked))
+        return Examination(tuple(_silent(facts, [], [], {})), (), nobody, {}, {}, (), None, ())
 
-    rig_repair, better, trust = None, None, None
+    rig_repair: Repair | None = None
+    better: tuple[Repair, list[Moment], Trust] | None = None
+    trust: Trust | None = None
     plain = quick_agreement(moments, asked)
     can_judge = len(asked) >= _FEWEST_TO_JUDGE
     if can_judge and plain < _HOPELESS:
@@ -119,7 +122,7 @@ def examine(facts: FrameFacts) -> Examination:
     named |= {facts.rig.names.index(name) for f in findings if not f.whole_rig for name in f.cameras}
     findings += _frozen(facts, runs, offsets, named)
     good = [i for i in members if i not in named]
-    findings += _silent(facts, moments, trust, good)
+    findings += _silent(facts, moments, good, offsets)
     doubtful = tuple(i for i in suspects if i not in named)
     order = {name: n for n, name in enumerate(facts.rig.names)}
     findings.sort(key=lambda f: (not f.whole_rig, order.get(f.cameras[0], 0) if f.cameras else 0))
@@ -277,9 +280,8 @@ def _late(
             continue
         assert offset.frames is not None
         n = round(offset.frames)
-        longest = max(
-            (len(run) - 1 for run in runs if run.camera_idx == i and not _at_end(facts, run)), default=0
-        )
+        inner = [run for run in runs if run.camera_idx == i and not _at_end(facts, run)]
+        longest = max((len(run) - 1 for run in inner), default=0)
         if longest > abs(n):
             # A camera that hung shows other moments than it should for that reason.
             continue
@@ -330,12 +332,17 @@ def _frozen(
     return found
 
 
-def _silent(facts: FrameFacts, moments: Sequence[Moment], trust: Trust, good: Sequence[int]) -> list[Finding]:
+def _silent(
+    facts: FrameFacts,
+    moments: Sequence[Moment],
+    good: Sequence[int],
+    offsets: dict[int, TimeOffset],
+) -> list[Finding]:
     """Cameras without a silhouette in frames in which they should show the person."""
     found = []
     n_frames = len(facts.frame_ids)
     for i in range(len(facts.rig)):
-        absent = np.flatnonzero(~facts.present[i])
+        absent = np.flatnonzero(_absent(facts, i, offsets.get(i)))
         if len(absent) < max(_FEWEST_ABSENT, _ABSENT_SHARE * n_frames) and len(absent) < n_frames:
             continue
         others = [j for j in good if j != i]
@@ -370,6 +377,16 @@ def _silent(facts: FrameFacts, moments: Sequence[Moment], trust: Trust, good: Se
             )
         )
     return found
+
+
+def _absent(facts: FrameFacts, i: int, offset: TimeOffset | None) -> Bool[np.ndarray, " t"]:
+    """(T,) frames without a silhouette, but for those that a camera which is late or early cannot have."""
+    absent = ~facts.present[i]
+    if offset is not None and offset.is_off and offset.frames is not None:
+        n = round(offset.frames)
+        beyond = slice(0, n) if n > 0 else slice(len(absent) + n, None)
+        absent[beyond] = False
+    return absent
 
 
 def _would_see(

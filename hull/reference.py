@@ -90,6 +90,7 @@ class Moment:
     tables: tuple[SilhouetteTable | None, ...]
     bounds: Bounds
     _kept: dict[tuple[tuple[int, ...], int], Coverage | None] = field(default_factory=dict)
+    _shown: dict[tuple[tuple[int, ...], int], Bool[np.ndarray, "_h _w"] | None] = field(default_factory=dict)
 
     def hull(self, members: Iterable[int], votes: int = 1) -> Coverage | None:
         """The hull of these cameras; None where nothing is left, or fewer than two of them have evidence."""
@@ -99,6 +100,15 @@ class Moment:
                 del self._kept[next(iter(self._kept))]
             self._kept[key] = self._carved(*key)
         return self._kept[key]
+
+    def rest_mask(self, members: Sequence[int], i: int) -> Bool[np.ndarray, "_h _w"] | None:
+        """What the hull of the members without camera i (see `rest_of`) shows to it; None: no hull, or part
+        of it behind the camera."""
+        key = (tuple(members), i)
+        if key not in self._shown:
+            hull = self.hull(rest_of(members, i))
+            self._shown[key] = None if hull is None else hull.mask(self.cameras[i])
+        return self._shown[key]
 
     def _carved(self, members: tuple[int, ...], votes: int) -> Coverage | None:
         tables = [table for i in members if (table := self.tables[i]) is not None]

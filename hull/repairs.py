@@ -177,11 +177,9 @@ def fits_with_pictures_of(
     moments: Sequence[Moment], members: Sequence[int], i: int, candidates: Sequence[int]
 ) -> dict[int, Fit]:
     """How the silhouettes of each candidate camera fit where camera i stands."""
-    others = rest_of(members, i)
     found: dict[int, list[Fit]] = {j: [] for j in candidates}
     for moment in moments:
-        hull = moment.hull(others)
-        covered = None if hull is None else hull.mask(moment.cameras[i])
+        covered = moment.rest_mask(members, i)
         if covered is None:
             continue
         for j in candidates:

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hull.coverage import Coverage
-from hull.reference import Moment, View, rest_of
+from hull.reference import Moment, View
 
 # Nine tenths of the outline stick out by no more than what is told.
 _QUANTILE = 0.9
@@ -22,12 +21,10 @@ def residuals(moments: Sequence[Moment], members: Sequence[int]) -> dict[int, fl
     """
     found: dict[int, list[float]] = {}
     for moment in moments:
-        whole: Coverage | None = moment.hull(members)
         for i, view in enumerate(moment.views):
             if view is None:
                 continue
-            hull = moment.hull(rest_of(members, i)) if i in members else whole
-            covered = None if hull is None else hull.mask(moment.cameras[i])
+            covered = moment.rest_mask(members, i)
             outside = np.zeros(0) if covered is None else _outside(covered, view)
             value = float(np.hypot(*view.mask.shape)) if not len(outside) else _told(outside)
             found.setdefault(i, []).append(value)
@@ -60,4 +57,5 @@ def _outside(covered: Bool[np.ndarray, "h w"], view: View) -> Float[np.ndarray, 
     whole[:b] = whole[-b:] = False
     whole[:, :b] = whole[:, -b:] = False
     away = cv2.distanceTransform((~covered).astype(np.uint8), cv2.DIST_L2, 5)
-    return away[whole].astype(np.float64)
+    # Between the centre of the outermost pixel that the hull covers and its edge.
+    return np.maximum(away[whole].astype(np.float64) - 0.5, 0.0)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from hull.reference import Moment, View, fit_of_mask, moment_of, rest_of
+from hull.reference import Moment, View, fit_of_mask, moment_of
 
 MOST_FRAMES = 14
 """How far away a camera's own moment is looked for, frames."""
@@ -113,10 +113,8 @@ def _table(
 ) -> Float[np.ndarray, "m s"]:
     """(M 2 most + 1) how camera i's silhouettes around each moment fit the hull of the other members; NaN."""
     table = np.full((len(moments), 2 * most + 1), np.nan)
-    others = rest_of(members, i)
     for row, moment in zip(table, moments, strict=True):
-        hull = moment.hull(others)
-        covered = None if hull is None else hull.mask(moment.cameras[i])
+        covered = moment.rest_mask(members, i)
         if covered is None or not covered.any():
             continue
         for shift in range(-most, most + 1):

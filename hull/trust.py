@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hull.reference import Fit, Moment, mean_fit, rest_of
+from hull.reference import NO_FIT, Fit, Moment, fit_of_mask, mean_fit
 
 # Silhouettes that stick out by less than this share are explained.
 EXPLAINED = 0.01
@@ -107,11 +107,11 @@ def fits_without_each(
     """For each camera asked, how its silhouettes fit the hull of the members without it, a frame each."""
     found: dict[int, list[Fit]] = {i: [] for i in asked}
     for moment in moments:
-        whole = moment.hull(members)
         for i in asked:
-            hull = moment.hull(rest_of(members, i)) if i in members else whole
-            for fit in moment.fits(hull, [i]).values():
-                found[i].append(fit)
+            view = moment.views[i]
+            if view is not None:
+                covered = moment.rest_mask(members, i)
+                found[i].append(NO_FIT if covered is None else fit_of_mask(covered, view))
     return found
 
 
