@@ -125,8 +125,8 @@ class Moment:
             surface = binary_surface(blocks)
             if votes > 1:
                 # Half a cell is exact enough for who is right at all.
-                between = 0.5 * (surface.inner + surface.outer)
-                return Coverage(grid.centres(between.T).T, surface.faces)
+                between = 0.5 * (surface.inner + surface.outer) + 0.5
+                return Coverage(grid.low + between * grid.voxel_m, surface.faces)
             crossings = cross_exactly(surface, grid, tables, Culling(tables, grid), votes)
         except HullError:
             return None
