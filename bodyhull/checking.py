@@ -270,6 +270,8 @@ def _metric_rig(
 
 def _full_moments(opened: Opened, facts: FrameFacts, found: Examination, rig: Rig) -> list[Moment]:
     """Some of the moments again, with whole pictures and the rig in metres."""
+    if max(facts.shrink) == 1:
+        return _in_metres(found.moments, rig)
     megapixels = sum(camera.size[0] * camera.size[1] for camera in rig) / 1e6
     n = _N_FULL if megapixels < _LARGE_MP else _N_FULL_LARGE
     places = [moment.k for moment in found.moments]
@@ -287,6 +289,20 @@ def _full_moments(opened: Opened, facts: FrameFacts, found: Examination, rig: Ri
         moment = moment_of(k, rig.cameras, masks)
         if moment is not None:
             made.append(moment)
+    return made
+
+
+def _in_metres(moments: Sequence[Moment], rig: Rig) -> list[Moment]:
+    """The moments as they are, where they were looked at with whole pictures and in metres already."""
+    made = []
+    for moment in moments:
+        ours = zip(moment.cameras, rig, strict=True)
+        if all(np.allclose(one.centre, other.centre, rtol=0, atol=1e-6) for one, other in ours):
+            made.append(moment)
+            continue
+        again = moment_of(moment.k, rig.cameras, [None if v is None else v.mask for v in moment.views])
+        if again is not None:
+            made.append(again)
     return made
 
 

@@ -23,7 +23,7 @@ from hull.repairs import Repair, best_for_rig, camera_repairs, fits_with_picture
 from hull.time_offsets import MOST_FRAMES, TimeOffset, time_offsets
 from hull.trust import Trust, fits_without_each, mean_fits, quick_agreement, trusted_cameras
 
-_N_MOMENTS, _N_MOMENTS_LARGE, _LARGE_RIG = 8, 4, 24
+_N_MOMENTS, _N_MOMENTS_LARGE, _LARGE_RIG = 6, 4, 24
 # A rig is looked at as a whole where less than this is explained.
 _WELL_EXPLAINED = 0.97
 # All cameras agree less than this (see `quick_agreement`) only where all of them are wrong.

@@ -30,8 +30,8 @@ from hull.trust import Trust, quick_agreement, trusted_cameras
 
 UNIT_RATIOS = (0.001, 1000.0, 0.01, 100.0, 0.1, 10.0, 0.0254, 39.37, 0.3048, 3.281)
 PICTURE_RATIOS = (2.0, 0.5, 4.0, 0.25, 1.5, 2 / 3, 3.0, 1 / 3)
-# A repair of the whole rig is looked into if all cameras agree so much better with it.
-_CLEARLY = 0.03
+# So many repairs of the whole rig are looked into, if all cameras agree no worse with them by this.
+_N_LIKELY, _NO_WORSE = 3, 0.01
 TURNS = ("left-right", "upside down", "by 180 degrees")
 
 
@@ -250,11 +250,14 @@ def rig_with(moments: Sequence[Moment], repair: Repair) -> list[Moment]:
 def likely_for_rig(
     moments: Sequence[Moment], asked: Sequence[int], plain: float
 ) -> list[tuple[float, Repair]]:
-    """The repairs of the whole rig with which all cameras agree clearly better than `plain`, best first; two
-    at most, which are as good as each other only where rig and person are symmetrical."""
+    """The few repairs of the whole rig with which all cameras agree best, and no worse than `plain`.
+
+    In a symmetrical rig with few cameras they are nearly as good as each other by that.
+    """
     few = moments[:: max(len(moments) // 2, 1)]
     tried = [(quick_agreement(rig_with(few, repair), asked), repair) for repair in whole_rig_repairs()]
-    return sorted((each for each in tried if each[0] > plain + _CLEARLY), key=lambda each: -each[0])[:2]
+    tried = [each for each in tried if each[0] > plain - _NO_WORSE]
+    return sorted(tried, key=lambda each: -each[0])[:_N_LIKELY]
 
 
 def best_for_rig(

@@ -16,9 +16,9 @@ import numpy as np
 from hull.reference import NO_FIT, Fit, Moment, fit_of_mask, mean_fit
 
 # Silhouettes that stick out by less than this share are explained.
-EXPLAINED = 0.01
+EXPLAINED = 0.02
 # Leaving a camera out must explain this share of what sticks out, and this much of the silhouettes.
-_GAIN, _LEAST_GAIN = 0.25, 0.004
+_GAIN, _LEAST_GAIN = 0.3, 0.01
 # So many cameras are tried a round: those that refuse most of what the others have in common.
 _N_TRIED = 10
 # Wrong ones that hide each other leave more than this; frames enough to tell.
