@@ -27,6 +27,8 @@ from hull.visual_hull import HullOptions, build_hull
 # Outlines that lie so many pixels (and this share of the picture's longer side) outside the others' hull,
 # and so many times the typical camera's, are not the silhouettes' doing.
 RESIDUAL_PX, RESIDUAL_SHARE, RESIDUAL_FACTOR = 6.0, 0.006, 2.5
+# A camera that forbids this share of what the others show lacks a part.
+FORBIDDEN = 0.04
 _N_FULL, _N_FULL_LARGE, _LARGE_MP = 4, 2, 100.0
 _VOXEL_M = 0.015
 _PERSON_M = (0.6, 3.5)
@@ -149,12 +151,13 @@ def check_recording(
     found = examine(facts)
     rig, per_unit, unit, unit_findings = _metric_rig(opened, facts, found)
     moments = _full_moments(opened, facts, found, rig)
-    axis, trouble = _world(opened, rig, found, up)
+    axis, trouble = _world(opened, rig, found, moments, up)
     numbers = _rig_numbers(opened, facts, found, rig, moments, unit, per_unit, axis)
     outside = residuals(moments, found.members) if found.members else {}
     cameras = _camera_numbers(facts, found, rig, outside, moments, axis, numbers)
     findings = [*opened.findings, *unit_findings, *found.findings]
-    findings += _loose(cameras, findings, found, facts)
+    findings += _lacking(found, facts)
+    findings += _loose(cameras, findings, facts)
     if trouble is not None and not findings:
         findings.append(
             Finding(
@@ -313,12 +316,18 @@ def _turned(image: np.ndarray, turn: str | None) -> np.ndarray:
     return np.ascontiguousarray(image[:: steps[0], :: steps[1]])
 
 
-def _world(opened: Opened, rig: Rig, found: Examination, up: str) -> tuple[np.ndarray | None, str | None]:
+def _world(
+    opened: Opened, rig: Rig, found: Examination, moments: Sequence[Moment], up: str
+) -> tuple[np.ndarray | None, str | None]:
     """The up axis by the cameras that agree, and why a run would refuse them all the same."""
     good = found.members or tuple(range(len(rig)))
+    cameras, masks = rig, None
+    if moments:
+        cameras = Rig(moments[0].cameras)
+        masks = [None if (view := moments[0].views[i]) is None else view.mask for i in good]
     try:
         world = settle_world(
-            Rig(tuple(rig[i] for i in good)), None, declared_unit="m", up=up, where=opened.where
+            Rig(tuple(cameras[i] for i in good)), masks, declared_unit="m", up=up, where=opened.where
         )
     except RecordingError as error:
         return None, str(error)
@@ -423,9 +432,22 @@ def field_of_view_deg(camera: Camera) -> tuple[float, float]:
     return float(np.degrees(across)), float(np.degrees(down))
 
 
-def _loose(
-    cameras: Sequence[CameraNumbers], findings: Sequence[Finding], found: Examination, facts: FrameFacts
-) -> list[Finding]:
+def _lacking(found: Examination, facts: FrameFacts) -> list[Finding]:
+    """Cameras that forbid what the others show, though no known mistake explains it, and lie inside them."""
+    return [
+        Finding(
+            FindingKind.SILHOUETTES,
+            (facts.rig.names[i],),
+            f"its silhouettes lack a part: they forbid {share:.0%} of what the other cameras show",
+            "look at them, and repair or leave out what is wrong",
+            numbers={"forbidden": share},
+        )
+        for i, share in found.doubtful.items()
+        if share > FORBIDDEN and i in found.fits and found.fits[i].surplus < FORBIDDEN
+    ]
+
+
+def _loose(cameras: Sequence[CameraNumbers], findings: Sequence[Finding], facts: FrameFacts) -> list[Finding]:
     """Cameras, or a whole rig, whose outlines stick out though no known mistake explains it."""
     named = {name for finding in findings if not finding.whole_rig for name in finding.cameras}
     told = {c.name: c.residual_px for c in cameras if c.residual_px is not None and c.name not in named}

@@ -21,7 +21,7 @@ from capture.still_pictures import FrozenRun, frozen_runs
 from hull.reference import NO_FIT, Fit, Moment, moment_of, normalising_scale
 from hull.repairs import Repair, best_for_rig, camera_repairs, fits_with_pictures_of, likely_for_rig, repaired
 from hull.time_offsets import MOST_FRAMES, TimeOffset, time_offsets
-from hull.trust import Trust, fits_without_each, mean_fits, quick_agreement, trusted_cameras
+from hull.trust import Trust, cut_by, fits_without_each, mean_fits, quick_agreement, trusted_cameras
 
 _N_MOMENTS, _N_MOMENTS_LARGE, _LARGE_RIG = 6, 4, 24
 # A rig is looked at as a whole where less than this is explained.
@@ -36,6 +36,8 @@ _LIFT, _REST = 0.05, 0.05
 # A camera that gives nothing in this share of the frames, where it should see the person, is dead.
 _ABSENT_SHARE, _FEWEST_ABSENT, _N_ASKED, _SEEN_SHARE = 0.05, 3, 6, 0.5
 _FEWEST_TO_JUDGE = 4
+# Fewer frames tell no time.
+_FEWEST_FRAMES = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +53,8 @@ class Examination:
     offsets : in frames.
     moments : what was looked at, in metres as far as known; `rig_repair` is done to them.
     rig_repair : the mistake of the whole rig, if there is one.
-    doubtful : cameras that fit badly and whose mistake is unknown.
+    doubtful : cameras that fit badly and whose mistake is unknown: the share of the others' silhouettes that
+        each forbids.
     """
 
     findings: tuple[Finding, ...]
@@ -61,7 +64,7 @@ class Examination:
     offsets: dict[int, TimeOffset]
     moments: tuple[Moment, ...]
     rig_repair: Repair | None
-    doubtful: tuple[int, ...]
+    doubtful: dict[int, float]
 
 
 def examine(facts: FrameFacts) -> Examination:
@@ -84,7 +87,7 @@ def examine(facts: FrameFacts) -> Examination:
     findings: list[Finding] = []
     if not moments or len(asked) < 2:
         nobody = Trust((), 1.0, len(asked))
-        return Examination(tuple(_silent(facts, [], [], {})), (), nobody, {}, {}, (), None, ())
+        return Examination(tuple(_silent(facts, [], [], {})), (), nobody, {}, {}, (), None, {})
 
     rig_repair: Repair | None = None
     better: tuple[Repair, list[Moment], Trust] | None = None
@@ -112,7 +115,10 @@ def examine(facts: FrameFacts) -> Examination:
     members = [i for i in trust.members if i not in suspects]
     if len(members) < max(3, len(asked) // 2):
         members = list(trust.members)
-    offsets = time_offsets(moments, members, asked, _turned_masks(mask_of, rig_repair), _reach(facts))
+    offsets: dict[int, TimeOffset] = {}
+    if len(facts.frame_ids) >= _FEWEST_FRAMES:
+        turned = _turned_masks(mask_of, rig_repair)
+        offsets = time_offsets(moments, members, asked, turned, _reach(facts))
     named: set[int] = set()
     if len(asked) >= _FEWEST_TO_JUDGE:
         for finding, those in _explained(facts, moments, members, fits, offsets, suspects, asked):
@@ -123,7 +129,7 @@ def examine(facts: FrameFacts) -> Examination:
     findings += _frozen(facts, runs, offsets, named)
     good = [i for i in members if i not in named]
     findings += _silent(facts, moments, good, offsets)
-    doubtful = tuple(i for i in suspects if i not in named)
+    doubtful = {i: cut_by(moments, good, i) for i in suspects if i not in named and i not in good}
     order = {name: n for n, name in enumerate(facts.rig.names)}
     findings.sort(key=lambda f: (not f.whole_rig, order.get(f.cameras[0], 0) if f.cameras else 0))
     return Examination(

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hull.reference import Moment, View
+from hull.reference import Moment, View, rest_of
 
 # Nine tenths of the outline stick out by no more than what is told.
 _QUANTILE = 0.9
@@ -17,12 +17,15 @@ _BORDER_PX = 2
 
 def residuals(moments: Sequence[Moment], members: Sequence[int]) -> dict[int, float]:
     """Per camera: nine tenths of its outline lie inside the hull of the other members, or outside by no more
-    than so many pixels; median over the moments. Clean silhouettes of a right camera: about half a pixel.
+    than so many pixels; median over the moments. The picture's diagonal where the hull does not show at all;
+    nothing for a camera without a hull of others. Clean silhouettes of a right camera: about half a pixel.
     """
     found: dict[int, list[float]] = {}
     for moment in moments:
         for i, view in enumerate(moment.views):
             if view is None:
+                continue
+            if moment.hull(rest_of(members, i)) is None:
                 continue
             covered = moment.rest_mask(members, i)
             outside = np.zeros(0) if covered is None else _outside(covered, view)

@@ -115,6 +115,19 @@ def fits_without_each(
     return found
 
 
+def cut_by(moments: Sequence[Moment], members: Sequence[int], i: int) -> float:
+    """The share of the members' silhouettes that camera i, which is none of them, forbids: so much more of
+    them sticks out of their common hull with it than without."""
+    few = moments[:: max(len(moments) // _N_MOMENTS, 1)]
+    with_it, without = [], []
+    for moment in few:
+        if moment.views[i] is None:
+            continue
+        with_it += [f.surplus for f in moment.fits(moment.hull([*members, i]), members).values()]
+        without += [f.surplus for f in moment.fits(moment.hull(members), members).values()]
+    return float(np.mean(with_it) - np.mean(without)) if with_it else 0.0
+
+
 def mean_fits(found: dict[int, list[Fit]]) -> dict[int, Fit]:
     """The mean over frames of `fits_without_each`, for cameras with any."""
     return {i: mean_fit(fits) for i, fits in found.items() if fits}

@@ -61,11 +61,13 @@ def test_a_dead_camera_is_named(tmp_path: Path, way: str) -> None:
     scene = filmed().copy()
     black = np.zeros_like(scene.masks[2][0])
     for k in range(N_FRAMES // 2 if "middle" in way else 0, N_FRAMES):
-        scene.masks[2][k] = {"no files": None, "files of no bytes": np.zeros((0, 0), np.uint8)}.get(way, black)
+        scene.masks[2][k] = {"no files": None, "files of no bytes": np.zeros((0, 0), np.uint8)}.get(
+            way, black
+        )
     check = checked(tmp_path, scene)
-    assert [(f.kind.value, f.cameras) for f in check.findings] == [
-        ("dead camera", ("cam-002",))
-    ], [f.sentence() for f in check.findings]
+    assert [(f.kind.value, f.cameras) for f in check.findings] == [("dead camera", ("cam-002",))], [
+        f.sentence() for f in check.findings
+    ]
 
 
 def test_time_offsets_of_several_cameras_are_exact(tmp_path: Path) -> None:
@@ -74,7 +76,9 @@ def test_time_offsets_of_several_cameras_are_exact(tmp_path: Path) -> None:
     assert [None if n is None else round(n) for n in offsets] == [0, 4, 0, 0, -3, 0], offsets
     late = [f for f in check.findings if f.kind.value == "unsynchronised camera"]
     assert [f.numbers["offset_frames"] for f in late] == [4, -3]
-    assert "cam-001: it is 4 frames late: its frame t + 4 shows what the others show at t" in late[0].sentence()
+    assert (
+        "cam-001: it is 4 frames late: its frame t + 4 shows what the others show at t" in late[0].sentence()
+    )
 
 
 def test_who_stands_still_tells_no_time_and_raises_no_alarm(tmp_path: Path) -> None:
@@ -85,7 +89,9 @@ def test_who_stands_still_tells_no_time_and_raises_no_alarm(tmp_path: Path) -> N
     assert check.findings == ()
 
 
-def test_the_command_tells_writes_and_returns_a_code(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_tells_writes_and_returns_a_code(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     recording, out = tmp_path / "recording", tmp_path / "out"
     recording.mkdir()
     where = write_scene(recording, filmed())
