@@ -1,6 +1,6 @@
 """What `bodyhull check` makes of planted faults, and of sound recordings. Prints Markdown tables.
 
-    python -m benchmarks.preflight --trials 20 --seed 1000      # every fault in 20 random recordings
+    python -m benchmarks.preflight --trials 20 --seed 1000      # each kind of fault in 20 random recordings
     python -m benchmarks.preflight --only sound mirrored        # some of them
     python -m benchmarks.preflight --offsets 40                 # time offsets from -10 to 10 frames
 
@@ -296,6 +296,16 @@ PLANTS: dict[str, Plant] = {
 }
 
 
+def variants(rng: np.random.Generator, every: bool) -> set[str]:
+    """One variant of each kind of fault, or every one."""
+    if every:
+        return set(PLANTS)
+    kinds: dict[str, list[str]] = {}
+    for name in PLANTS:
+        kinds.setdefault(name.split(",")[0], []).append(name)
+    return {str(rng.choice(names)) for names in kinds.values()}
+
+
 def told_by(check: Check) -> list[tuple[str, frozenset[str] | None]]:
     """Kind and camera numbers of every finding; None: the whole rig."""
     return [
@@ -304,15 +314,16 @@ def told_by(check: Check) -> list[tuple[str, frozenset[str] | None]]:
     ]
 
 
-def run_trials(n: int, seed: int, only: list[str], verbose: bool) -> None:
+def run_trials(n: int, seed: int, only: list[str], every: bool, verbose: bool) -> None:
     print(machine())
     named: Counter[str] = Counter()
     table: dict[str, Counter[str]] = {name: Counter() for name in PLANTS}
     seconds: list[float] = []
     for trial in range(n):
         scene = make_scene(seed + trial)
+        chosen = variants(np.random.default_rng([seed + trial, 5]), every)
         for number, (name, plant) in enumerate(PLANTS.items()):
-            if only and not any(name.startswith(word) for word in only):
+            if name not in chosen or (only and not any(name.startswith(word) for word in only)):
                 continue
             rng = np.random.default_rng([seed + trial, number])
             made, kind, cameras = plant(scene, rng)
@@ -341,6 +352,12 @@ def run_trials(n: int, seed: int, only: list[str], verbose: bool) -> None:
             so_far = ", ".join(f"{name} {named[name]}" for name, told_so in table.items() if told_so)
             print(f"<!-- right of {trial + 1}: {so_far} -->", flush=True)
     print(f"\n{n} recordings from seed {seed}; {np.mean(seconds):.1f} s processor time a check\n")
+    kinds: dict[str, list[int]] = {}
+    for name, column in table.items():
+        count = kinds.setdefault(name.split(",")[0], [0, 0])
+        count[0] += named[name]
+        count[1] += sum(column.values())
+    print(", ".join(f"{kind} {right} of {of}" for kind, (right, of) in kinds.items() if of) + "\n")
     print("| planted | named right | told |")
     print("| --- | --- | --- |")
     for name, column in table.items():
@@ -390,6 +407,7 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1000)
     parser.add_argument("--only", nargs="*", default=[], help="faults whose name begins with one of these")
+    parser.add_argument("--every", action="store_true", help="every variant of a fault, not one by chance")
     parser.add_argument("--offsets", type=int, default=0, help="trials of time offsets instead")
     parser.add_argument("--keep", type=Path, help="write the recording of --seed with --only there, and stop")
     parser.add_argument("--verbose", action="store_true", help="tell how far it is")
@@ -404,7 +422,7 @@ def main() -> None:
     elif options.offsets:
         run_offsets(options.offsets, options.seed, options.verbose)
     else:
-        run_trials(options.trials, options.seed, options.only, options.verbose)
+        run_trials(options.trials, options.seed, options.only, options.every, options.verbose)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from bodyhull.checking import CameraNumbers, Check
+from bodyhull.check_numbers import CameraNumbers
+from bodyhull.checking import Check
 from bodyhull.folder import write_atomically
 from render.check_plot import draw_areas, draw_offsets
 from render.report import Image, ReportData, Table, write_report

@@ -12,12 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool
 
-from capture.camera import Camera
 from capture.finding import Finding, FindingKind
 from capture.frame_facts import FrameFacts
 from capture.still_pictures import FrozenRun, frozen_runs
+from hull.moments_verdict import frozen_cameras, late_cameras, silent_cameras
 from hull.reference import NO_FIT, Fit, Moment, moment_of, normalising_scale
 from hull.repairs import Repair, best_for_rig, camera_repairs, fits_with_pictures_of, likely_for_rig, repaired
 from hull.time_offsets import MOST_FRAMES, TimeOffset, time_offsets
@@ -33,8 +32,6 @@ _HOPELESS = 0.4
 _SURPLUS, _FACTOR, _BIT = 0.03, 3.0, 0.01
 # A mistake undone must lift the fit by so much and leave no more sticking out than this.
 _LIFT, _REST = 0.05, 0.05
-# A camera that gives nothing in this share of the frames, where it should see the person, is dead.
-_ABSENT_SHARE, _FEWEST_ABSENT, _N_ASKED, _SEEN_SHARE = 0.05, 3, 6, 0.5
 _FEWEST_TO_JUDGE = 4
 # Fewer frames tell no time.
 _FEWEST_FRAMES = 6
@@ -87,7 +84,7 @@ def examine(facts: FrameFacts) -> Examination:
     findings: list[Finding] = []
     if not moments or len(asked) < 2:
         nobody = Trust((), 1.0, len(asked))
-        return Examination(tuple(_silent(facts, [], [], {})), (), nobody, {}, {}, (), None, {})
+        return Examination(tuple(silent_cameras(facts, [], [], {})), (), nobody, {}, {}, (), None, {})
 
     rig_repair: Repair | None = None
     better: tuple[Repair, list[Moment], Trust] | None = None
@@ -124,11 +121,11 @@ def examine(facts: FrameFacts) -> Examination:
         for finding, those in _explained(facts, moments, members, fits, offsets, suspects, asked):
             findings.append(finding)
             named |= those
-    findings += _late(facts, offsets, runs, named, asked)
+    findings += late_cameras(facts, offsets, runs, named, asked)
     named |= {facts.rig.names.index(name) for f in findings if not f.whole_rig for name in f.cameras}
-    findings += _frozen(facts, runs, offsets, named)
+    findings += frozen_cameras(facts, runs, offsets, named)
     good = [i for i in members if i not in named]
-    findings += _silent(facts, moments, good, offsets)
+    findings += silent_cameras(facts, moments, good, offsets)
     doubtful = {i: cut_by(moments, good, i) for i in suspects if i not in named and i not in good}
     order = {name: n for n, name in enumerate(facts.rig.names)}
     findings.sort(key=lambda f: (not f.whole_rig, order.get(f.cameras[0], 0) if f.cameras else 0))
@@ -269,138 +266,3 @@ def _circle(best: dict[int, _Candidate], start: int) -> list[int]:
         group.append(at)
         at = best[at].other
     return group if at == start else []
-
-
-def _late(
-    facts: FrameFacts,
-    offsets: dict[int, TimeOffset],
-    runs: Sequence[FrozenRun],
-    named: set[int],
-    asked: Sequence[int],
-) -> list[Finding]:
-    found = []
-    step = facts.usual_step
-    for i in asked:
-        offset = offsets.get(i)
-        if i in named or offset is None or not offset.is_off or len(asked) < 3:
-            continue
-        assert offset.frames is not None
-        n = round(offset.frames)
-        inner = [run for run in runs if run.camera_idx == i and not _at_end(facts, run)]
-        longest = max((len(run) - 1 for run in inner), default=0)
-        if longest > abs(n):
-            # A camera that hung shows other moments than it should for that reason.
-            continue
-        late = "late" if n > 0 else "early"
-        found.append(
-            Finding(
-                FindingKind.UNSYNCHRONISED,
-                (facts.rig.names[i],),
-                f"it is {abs(n) * step} frame{'s' * (abs(n) * step != 1)} {late}: its frame t "
-                f"{'+' if n > 0 else '-'} {abs(n) * step} shows what the others show at t",
-                f"renumber its frames by {-n * step:+d}",
-                numbers={"offset_frames": n * step},
-            )
-        )
-    return found
-
-
-def _at_end(facts: FrameFacts, run: FrozenRun) -> bool:
-    return run.first == 0 or run.last == len(facts.frame_ids) - 1
-
-
-def _frozen(
-    facts: FrameFacts, runs: Sequence[FrozenRun], offsets: dict[int, TimeOffset], named: set[int]
-) -> list[Finding]:
-    found = []
-    for i in sorted({run.camera_idx for run in runs}):
-        mine = [run for run in runs if run.camera_idx == i]
-        if i in named:
-            offset = offsets.get(i)
-            n = 0 if offset is None or offset.frames is None else abs(round(offset.frames))
-            # A late camera whose first picture stands in for those that it has not got.
-            mine = [run for run in mine if not (_at_end(facts, run) and len(run) - 1 <= n)]
-        if not mine:
-            continue
-        n_repeats = sum(len(run) - 1 for run in mine)
-        stretches = ", ".join(
-            f"{facts.frame_ids[run.first]} to {facts.frame_ids[run.last]}" for run in mine[:4]
-        ) + ", ..." * (len(mine) > 4)
-        found.append(
-            Finding(
-                FindingKind.STALE,
-                (facts.rig.names[i],),
-                f"it repeats one picture while the others move (frames {stretches})",
-                "copy these frames from the camera again, or delete them (a missing picture does no harm)",
-                numbers={"frames": n_repeats},
-            )
-        )
-    return found
-
-
-def _silent(
-    facts: FrameFacts,
-    moments: Sequence[Moment],
-    good: Sequence[int],
-    offsets: dict[int, TimeOffset],
-) -> list[Finding]:
-    """Cameras without a silhouette in frames in which they should show the person."""
-    found = []
-    n_frames = len(facts.frame_ids)
-    for i in range(len(facts.rig)):
-        absent = np.flatnonzero(_absent(facts, i, offsets.get(i)))
-        if len(absent) < max(_FEWEST_ABSENT, _ABSENT_SHARE * n_frames) and len(absent) < n_frames:
-            continue
-        others = [j for j in good if j != i]
-        asked = absent[np.linspace(0, len(absent) - 1, min(_N_ASKED, len(absent))).astype(int)]
-        expected = [
-            _would_see(moments[0].cameras, facts, others, i, int(k)) for k in np.unique(asked) if moments
-        ]
-        told = [share for share in expected if share is not None]
-        if len(absent) == n_frames and not told:
-            share = 1.0
-        elif not told:
-            continue
-        else:
-            share = float(np.mean([value > _SEEN_SHARE for value in told]))
-        if share < 0.75:
-            continue
-        always = len(absent) == n_frames
-        where = (
-            "in none of the frames looked at"
-            if always
-            else f"not in {len(absent)} of {n_frames} frames (first {facts.frame_ids[absent[0]]})"
-        )
-        found.append(
-            Finding(
-                FindingKind.DEAD,
-                (facts.rig.names[i],),
-                f"it shows the person {where}, though it should" if told else f"it shows a person {where}",
-                "look at its files and cable, and leave it out"
-                if always
-                else "look at its pictures there; frames without one do no harm but few witnesses",
-                numbers={"frames": len(absent)},
-            )
-        )
-    return found
-
-
-def _absent(facts: FrameFacts, i: int, offset: TimeOffset | None) -> Bool[np.ndarray, " t"]:
-    """(T,) frames without a silhouette, but for those that a camera which is late or early cannot have."""
-    absent = ~facts.present[i]
-    if offset is not None and offset.is_off and offset.frames is not None:
-        n = round(offset.frames)
-        beyond = slice(0, n) if n > 0 else slice(len(absent) + n, None)
-        absent[beyond] = False
-    return absent
-
-
-def _would_see(
-    cameras: Sequence[Camera], facts: FrameFacts, others: Sequence[int], i: int, k: int
-) -> float | None:
-    """The share of the others' hull that lies in camera i's picture; None without a hull."""
-    moment = moment_of(k, cameras, [facts.mask(j, k) if j in others else None for j in range(len(cameras))])
-    if moment is None:
-        return None
-    hull = moment.hull(others)
-    return None if hull is None else hull.share_in_picture(cameras[i])

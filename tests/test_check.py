@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -11,7 +12,10 @@ import pytest
 
 from benchmarks.preflight import PLANTS, Scene, late_by, told_by, write_scene
 from bodyhull.checking import check_recording
+from capture.frame_facts import scaled_camera
 from capture.layouts import dome_layout
+from capture.rig import Rig
+from capture.still_pictures import frozen_runs
 from tests.capture_scenes import PERSON, ball_mask
 from tests.command_line import call
 
@@ -140,6 +144,49 @@ def test_a_calibrated_camera_without_pictures_is_told(tmp_path: Path) -> None:
         "dead camera: camera cam-003: calibrated, but the recording has no picture of it; restore its "
         "pictures, or take it out of the calibration"
     ]
+
+
+def test_silhouettes_that_lack_a_part_are_told(tmp_path: Path) -> None:
+    scene = filmed().copy()
+    for k, mask in enumerate(scene.masks[2]):
+        rows = np.flatnonzero(mask.any(axis=1))
+        scene.masks[2][k] = mask.copy()
+        scene.masks[2][k][rows[0] + int(0.65 * len(rows)) :] = 0
+    check = checked(tmp_path, scene)
+    assert [(f.kind.value, f.cameras) for f in check.findings] == [("wrong silhouettes", ("cam-002",))]
+    assert "they forbid" in check.findings[0].text and check.findings[0].numbers["forbidden"] > 0.1
+
+
+@pytest.mark.parametrize("n_cameras", [1, 2, 3])
+def test_few_cameras_and_few_frames_raise_no_alarm(tmp_path: Path, n_cameras: int) -> None:
+    scene = filmed()
+    few = replace(
+        scene,
+        rig=Rig(scene.rig.cameras[:n_cameras]),
+        masks=[row[: 3 if n_cameras == 3 else None] for row in scene.masks[:n_cameras]],
+    )
+    check = checked(tmp_path, few)
+    assert check.findings == (), [f.sentence() for f in check.findings]
+    assert len(check.cameras) == n_cameras
+
+
+def test_a_run_of_equal_pictures_counts_only_while_others_move() -> None:
+    facts = SimpleNamespace(
+        changed=np.array([[np.nan, 0.1, 0.1, 0.0, 0.0, 0.0, 0.1], *[[np.nan, *[0.1] * 6]] * 3]),
+        border=np.zeros((4, 7), dtype=bool),
+        present=np.ones((4, 7), dtype=bool),
+    )
+    assert [(r.camera_idx, r.first, r.last) for r in frozen_runs(facts)] == [(0, 2, 5)]  # type: ignore[arg-type]
+    facts.changed[1:] = 0.0
+    assert frozen_runs(facts) == []  # type: ignore[arg-type]
+
+
+def test_a_camera_for_smaller_pictures_sees_the_same() -> None:
+    camera = filmed().rig[0]
+    half = scaled_camera(camera, 0.5)
+    points = np.array([[0.1, 0.2, 1.0], [-0.3, 0.1, 0.4]])
+    corner, half_corner = camera.project(points)[0] + 0.5, half.project(points)[0] + 0.5
+    np.testing.assert_allclose(half_corner, corner / 2, atol=1e-9)
 
 
 def test_a_picture_of_another_size_than_calibrated_is_a_finding_not_an_error(tmp_path: Path) -> None:
