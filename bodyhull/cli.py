@@ -15,6 +15,7 @@ import tyro
 import bodyhull
 from bodyhull.body_commands import Body, perform_body
 from bodyhull.calibrate_commands import Calibrate, perform_calibrate
+from bodyhull.check_commands import CheckRecording, perform_check
 from bodyhull.config import FIT_OPTIONS, RunConfig, Units, Up
 from bodyhull.convert_commands import Convert, perform_convert
 from bodyhull.errors import ERROR, FRAMES_FAILED, OK, UserError
@@ -171,6 +172,7 @@ Command = (
     | Annotated[Convert, tyro.conf.subcommand("convert")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[MakeSilhouettes, tyro.conf.subcommand("silhouettes")]
+    | Annotated[CheckRecording, tyro.conf.subcommand("check")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
 )
@@ -277,6 +279,8 @@ def perform(command: object) -> int:
             return perform_calibrate(command)
         case MakeSilhouettes():
             return perform_silhouettes(command)
+        case CheckRecording():
+            return perform_check(command)
         case Doctor():
             from bodyhull.doctor import findings, print_findings
 

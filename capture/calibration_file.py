@@ -20,6 +20,14 @@ from capture.rig_checks import lens_doubts
 from capture.rig_formats import CALIBRATION_ENDINGS, detect_format, known_formats, read_rig_of
 
 
+class PictureSizeError(RecordingError):
+    """A camera that is calibrated for pictures of another size. camera : its name in the recording."""
+
+    def __init__(self, text: str, camera: str, calibrated: tuple[int, int]) -> None:
+        super().__init__(text)
+        self.camera, self.calibrated = camera, calibrated
+
+
 @dataclass(frozen=True)
 class Calibration:
     """What a calibration file says, for the cameras that have pictures.
@@ -132,9 +140,11 @@ def _paired(foreign: ForeignRig, path: Path, sizes: Mapping[str, tuple[int, int]
                 f"(it has {', '.join(foreign.names)})"
             )
         if camera.size is not None and camera.size != size:
-            raise RecordingError(
+            raise PictureSizeError(
                 f"{path}: camera {name} is calibrated for {camera.size[0]}x{camera.size[1]} px, "
-                f"its pictures are {size[0]}x{size[1]} px; use pictures of the calibrated size"
+                f"its pictures are {size[0]}x{size[1]} px; use pictures of the calibrated size",
+                name,
+                camera.size,
             )
         cameras.append(camera.sized(size, name))
         by_name.pop(camera.name, None)

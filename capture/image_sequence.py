@@ -76,8 +76,11 @@ def choose_sequence(root: Path, wanted: str | None) -> tuple[str, Path]:
     return next(iter(found.items()))
 
 
-def find_images(name: str, folder: Path) -> ImageFolders:
-    """List a sequence's files. Raises RecordingError where no camera has a silhouette that can be opened."""
+def find_images(name: str, folder: Path, *, keep_unreadable: bool = False) -> ImageFolders:
+    """List a sequence's files. Raises RecordingError where no camera has a silhouette that can be opened.
+
+    `keep_unreadable`: such a camera is kept, its pictures taken to be as large as most others'.
+    """
     silhouettes = camera_folders(folder / SILHOUETTES)
     if not silhouettes:
         raise RecordingError(f"{folder / SILHOUETTES}: no cam-NNN folder with silh_NNNNNN.png files in it")
@@ -85,12 +88,20 @@ def find_images(name: str, folder: Path) -> ImageFolders:
     sizes: dict[str, tuple[int, int]] = {}
     for camera, files in silhouettes.items():
         size = _usual_size(files)
+        if size is None and keep_unreadable:
+            continue
         if size is None:
             raise RecordingError(
                 f"{folder / SILHOUETTES / camera}: none of the first silhouettes can be opened; "
                 "restore the files or move the folder out of the recording"
             )
         sizes[camera] = size
+    if not sizes:
+        raise RecordingError(
+            f"{folder / SILHOUETTES}: none of the first silhouettes of any camera can be opened"
+        )
+    usual = Counter(sizes.values()).most_common(1)[0][0]
+    sizes = {camera: sizes.get(camera, usual) for camera in silhouettes}
     return ImageFolders(name, sizes, silhouettes, {name: pictures.get(name, {}) for name in silhouettes})
 
 

@@ -164,11 +164,7 @@ def _open_videos(
 def _open_images(
     root: Path, sequence: str | None, calibration_path: Path | None, frames: str | None, units: str, up: str
 ) -> Recording:
-    if (root / "SilhouettesPictures").is_dir() and not (root / "setup").is_dir() and sequence is None:
-        parent = root.resolve().parent
-        if calibration_path is None and (parent / "setup").is_dir():
-            # The sequence's own folder was given: its calibration lies one level up.
-            root, sequence = parent, root.resolve().name
+    root, sequence = own_sequence(root, sequence, calibration_path)
     name, folder = choose_sequence(root, sequence)
     images = find_images(name, folder)
     calibration_path = calibration_path or _own_calibration(root)
@@ -198,7 +194,7 @@ def _open_images(
     notes = [*calibration.notes, *doubts]
     if inverted:
         notes.append(f"Silhouettes are black on white, swapped on reading: {', '.join(sorted(inverted))}.")
-    notes += _gap_notes(probe, chosen)
+    notes += gap_notes(probe, chosen)
     delivered = calibration.rig.with_world_scaled(world.metres_per_unit)
     return _recording(name, calibration, world, chosen, notes, ImageSequence(images, delivered, inverted))
 
@@ -219,6 +215,16 @@ def _own_calibration(root: Path) -> Path:
         names = ", ".join(str(path.relative_to(root)) for path in found)
         raise RecordingError(f"{root}: several calibrations ({names}); choose one with --calibration FILE")
     return found[0] if found else root / "setup"
+
+
+def own_sequence(root: Path, sequence: str | None, calibration: Path | None) -> tuple[Path, str | None]:
+    """The recording's folder and the sequence, where the sequence's own folder was given."""
+    if (root / "SilhouettesPictures").is_dir() and not (root / "setup").is_dir() and sequence is None:
+        parent = root.resolve().parent
+        if calibration is None and (parent / "setup").is_dir():
+            # Its calibration lies one level up.
+            return parent, root.resolve().name
+    return root, sequence
 
 
 def _recording(
@@ -244,7 +250,7 @@ def _recording(
     )
 
 
-def _gap_notes(source: ImageSequence, chosen: tuple[int, ...]) -> list[str]:
+def gap_notes(source: ImageSequence, chosen: tuple[int, ...]) -> list[str]:
     """Sentences on frames that some cameras lack, and on numbers that no camera has."""
     notes = []
     for camera in source.calibration:

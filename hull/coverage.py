@@ -61,6 +61,21 @@ class Coverage:
         covered[y : y + within.shape[0], x : x + within.shape[1]] = within
         return covered
 
+    def share_in_picture(self, camera: Camera) -> float:
+        """The share of the surface's vertices that the camera's picture shows, hidden ones counted."""
+        p = np.asarray(camera.projection_matrix, dtype=np.float64)
+        u, v, depth = p[:, :3] @ self._columns + p[:, 3:]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = u / depth, v / depth
+        width, height = camera.size
+        return float(
+            (
+                (depth > 0)
+                & (np.abs(u - (width - 1) / 2) < width / 2)
+                & (np.abs(v - (height - 1) / 2) < height / 2)
+            ).mean()
+        )
+
     def in_box(self, camera: Camera) -> tuple[int, int, Bool[np.ndarray, "h2 w2"]] | None:
         """`mask` within the surface's own box in the picture, whose first column and row come first."""
         width, height = camera.size
