@@ -42,7 +42,8 @@ _LEAST_GAIN_PX, _CLEAR, _RATIO = 0.05, 3.0, 0.6
 _MOST_MISS_PX = 5.0
 _REACH = 0.65  # of the subject's extent, to both sides of its middle
 _FACTORS = (1.0, 1 / 2, 1 / 4, 2.0, 4.0, 1 / 3, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 3.0)
-_OFFSETS_PX = (-1.0, -0.5, 0.0, 0.5)
+# Symmetric about what is kept without evidence: noise flattens the peak and draws it to their middle.
+_OFFSETS_PX = (-1.0, -0.5, 0.0, 0.5, 1.0)
 _CLIP_PX = (-3.0, 2.0)
 _NEAR_PX, _MOST_ERROR_PX = 0.2, 0.08
 _ENOUGH = 10  # cameras times frames from which half a pixel should be told
@@ -145,8 +146,8 @@ class _Fit:
     convention: Convention
     share: float
     right_handed: bool
-    depths: Float[np.ndarray, "n 4"]
-    misses: Float[np.ndarray, "n 4"]
+    depths: Float[np.ndarray, "n o"]
+    misses: Float[np.ndarray, "n o"]
 
     @property
     def least_misses(self) -> Float[np.ndarray, " n"]:
@@ -168,14 +169,17 @@ class _Fit:
         left_out = [_peak(np.delete(self.depths, k, axis=0).mean(axis=0)) for k in range(n)]
         if any(value is None for value in left_out):
             return None
-        return -whole, _jackknife_error(np.array(left_out, dtype=np.float64))
+        spread = _jackknife_error(np.array(left_out, dtype=np.float64))
+        # Two frames of a camera err alike, and cameras that are off by some pixels have a common part of
+        # about that over the root of their number.
+        return -whole, float(np.hypot(np.sqrt(2) * spread, self.miss_px / np.sqrt(n / 2)))
 
 
 def _fit(
     rig: Rig, convention: Convention, frames: Sequence[Masks], evidence: Sequence[Evidence], coarse: Evidence
 ) -> _Fit:
-    variants = [replace(convention, first_px=-offset).applied(rig) for offset in _OFFSETS_PX]
-    meant = variants[_OFFSETS_PX.index(0.0)]
+    meant = convention.applied(rig)
+    variants = [_moved_along_rows(rig, convention, offset) for offset in _OFFSETS_PX]
     depths, misses = [], []
     for masks, one in zip(frames, evidence, strict=True):
         place = _place(meant, masks)
@@ -191,6 +195,22 @@ def _fit(
         _is_right_handed(meant, frames[0]),
         np.array(depths).reshape(-1, len(_OFFSETS_PX)),
         np.array(misses).reshape(-1, len(_OFFSETS_PX)),
+    )
+
+
+def _moved_along_rows(rig: Rig, convention: Convention, offset_px: float) -> Rig:
+    """As `convention.applied`, after moving the file's pixels along their rows.
+
+    Along columns as well, hulls of cameras that look down would move with the pixels and tell nothing.
+    """
+    along = np.array([[1, 0, offset_px], [0, 1, 0], [0, 0, 1.0]])
+    return Rig(
+        tuple(
+            camera_from_projection(
+                c.name, c.size, convention.ours_from_file(c.size) @ along @ c.projection_matrix
+            )
+            for c in rig
+        )
     )
 
 
@@ -261,7 +281,7 @@ def _place(rig: Rig, masks: Masks) -> tuple[Float[np.ndarray, " 3"], float] | No
     return subject, _REACH * extent
 
 
-def _peak(values: Float[np.ndarray, "4"]) -> float | None:
+def _peak(values: Float[np.ndarray, " o"]) -> float | None:
     """Offset at which a parabola through the values of `_OFFSETS_PX` peaks; None where it opens upwards."""
     bend, slope, _ = np.polyfit(_OFFSETS_PX, values, 2)
     return None if bend > -1e-3 else float(-slope / (2 * bend))

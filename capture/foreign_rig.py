@@ -122,9 +122,9 @@ def given_camera(
 ) -> GivenCamera:
     """A camera after the checks that every format needs.
 
-    Lists or arrays, not yet looked at: intrinsics (3 3) px, OpenCV's pixels; rotation: world to camera, (3 3) or a Rodrigues vector (3), rad;
-    translation (3), world units; distortion in OpenCV's order, all zero meaning a pinhole. Raises
-    RecordingError that names the file and the camera.
+    Lists or arrays as they were read: intrinsics (3 3) px, OpenCV's pixels; rotation: world to camera, (3 3)
+    or a Rodrigues vector (3), rad; translation (3), world units; distortion in OpenCV's order, all zero
+    meaning a pinhole. Raises RecordingError that names the file and the camera.
     """
     where = f"{place}: camera {name}"
     matrix = _numbers(where, "camera matrix", intrinsics, (3, 3))

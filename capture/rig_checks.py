@@ -74,12 +74,11 @@ def _upright_only_when_inverted(rig: Rig) -> bool:
     """Inverted, cameras round a point near the origin all look at one point from close by; but their
     pictures' up directions then point everywhere."""
     inverted = with_inverted_poses(rig)
-    if not poses_look_inverted(inverted) and len(rig) > 2:
-        as_given, turned = (
-            float(np.linalg.norm(np.mean([c.up for c in r], axis=0))) for r in (rig, inverted)
-        )
-        return as_given < _SCATTERED_UP and turned > _COMMON_UP
-    return False
+    as_given, turned = (
+        float(np.linalg.norm(np.mean([camera.up for camera in cameras], axis=0)))
+        for cameras in (rig, inverted)
+    )
+    return len(rig) > 2 and as_given < _SCATTERED_UP and turned > _COMMON_UP
 
 
 def guess_unit(rig: Rig) -> tuple[str | None, float]:

@@ -246,13 +246,14 @@ def _format_of_file(path: Path) -> str | None:
         raise RecordingError(f"{path}: cannot be read ({error.strerror})") from error
     suffix = path.name.lower()
     if head.startswith(NPY_MAGIC) or suffix.endswith(".npy"):
-        return "zju-mocap"
+        holds_objects = b"|O" in head[:256] or path.name == "annots.npy"
+        return "zju-mocap" if holds_objects else None
     model = colmap.find_model(path.parent) if path.stem.lower() in ("cameras", "images") else None
     if model is not None and model[0] == path.parent:
         return "colmap"
     text = head.decode("utf-8-sig", errors="replace").lstrip()
-    if text.startswith("<"):
-        return _format_of_xml(text)
+    if text.startswith("<") and (found := _format_of_xml(text)) is not None:
+        return found
     if suffix.endswith((".qca.txt", ".qca")):
         return "qualisys"
     if suffix.endswith(".xcp"):
@@ -277,7 +278,7 @@ def _format_of_xml(text: str) -> str | None:
         return "opencv"
     if re.search(r"<Cameras?[\s>]", text):
         return "vicon"
-    return "qualisys"
+    return "qualisys" if re.search(r"<(calibration|cameras?)[\s>/]", text) else None
 
 
 def _format_of_json(path: Path) -> str | None:
@@ -297,12 +298,11 @@ def _format_of_yaml(path: Path) -> str | None:
         return "easymocap"
     if path.stem in ("intri", "extri"):
         return "easymocap"  # its reader says that the other half is missing
-    if b"%YAML" in path.read_bytes()[:64]:
-        return "opencv"
     try:
         return "opencv" if opencv.has_cameras(read_tree(path)) else None
     except RecordingError:
-        return None
+        # OpenCV's own, but broken: its reader says so.
+        return "opencv" if b"%YAML" in path.read_bytes()[:64] else None
 
 
 def _format_of_toml(path: Path) -> str | None:

@@ -39,7 +39,9 @@ def planted(rig: Rig, convention: Convention) -> Rig:
 
 
 def frames_of(rig: Rig, n_frames: int = 2) -> list[list[np.ndarray]]:
-    return [[ball_mask(c, PERSON + [0.15 * k, 0.1 * k, 0, 0]) for c in rig] for k in range(n_frames)]
+    return [
+        [ball_mask(c, PERSON + np.array([0.15 * k, 0.1 * k, 0, 0])) for c in rig] for k in range(n_frames)
+    ]
 
 
 def write_planted(root, rig: Rig, convention: Convention):

@@ -188,3 +188,15 @@ def test_odd_cameras_are_told_in_a_sentence_each() -> None:
     assert "Cameras cam-003 look away from where the others aim" in placement_doubts(away, 1.0)[0]
     assert guess_unit(rig) == ("m", pytest.approx(4, abs=0.2))
     assert guess_unit(rig.with_world_scaled(200.0))[0] is None
+
+
+def test_other_files_in_a_recording_are_no_calibrations(tmp_path: Path) -> None:
+    rig = small_rig(4)
+    write_videos(tmp_path, rig, n_frames=2)
+    np.save(tmp_path / "offsets.npy", np.zeros(4))
+    (tmp_path / "settings.xml").write_text("<settings><gain>3</gain></settings>")
+    (tmp_path / "notes.yml").write_text("%YAML:1.0\n---\nplace: 3\n")
+    (tmp_path / "config.toml").write_text("[project]\nname = 'x'\n")
+    (tmp_path / "people.json").write_text('{"annotations": []}')
+    assert find_calibrations(tmp_path) == [tmp_path / "rig.json"]
+    assert open_recording(tmp_path).calibration == rig

@@ -20,8 +20,8 @@ N_TERMS = {"bodyhull": 8, "colmap": 8, "colmap-text": 8, "easymocap": 8, "opencv
 HOLD_SKEW = {"bodyhull", "inria", "easymocap", "opencv", "aniposelib", "pose2sim", "caliscope", "qualisys",
              "zju-mocap", "middlebury"}  # fmt: skip
 NO_SIZES = {"inria", "zju-mocap", "middlebury"}
-UNITS = {"bodyhull": "m", "easymocap": "m", "pose2sim": "m", "caliscope": "m", "actorshq": "m", "qualisys": "mm",
-         "vicon": "mm", "zju-mocap": "mm"}  # fmt: skip
+UNITS = {"bodyhull": "m", "easymocap": "m", "pose2sim": "m", "caliscope": "m", "actorshq": "m",
+         "qualisys": "mm", "vicon": "mm", "zju-mocap": "mm"}  # fmt: skip
 
 
 def back(rig: Rig, path: Path) -> tuple[Rig, str | None, tuple[str, ...]]:

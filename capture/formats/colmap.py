@@ -28,6 +28,12 @@ from jaxtyping import Float
 from capture.camera import Camera
 from capture.errors import RecordingError
 from capture.foreign_rig import ForeignRig, GivenCamera, foreign_rig, given_camera
+from capture.formats.colmap_binary import (
+    checked_cameras,
+    checked_frames,
+    checked_rigs,
+    images_without_points,
+)
 from capture.formats.limits import key_names, require_no_skew
 from capture.rig import Rig
 
@@ -125,29 +131,51 @@ def write_colmap(rig: Rig, folder: Path, text: bool = False) -> list[str]:
 
 
 def _load(place: Path, ending: str) -> Any:
-    """The model; a points3D file that is missing stands for no points."""
+    """The model, without its points."""
     import pycolmap
 
-    with tempfile.TemporaryDirectory() as scratch:
-        source = place
-        if not (place / f"points3D.{ending}").is_file():
-            source = Path(scratch)
-            for part in PARTS:
-                if (place / f"{part}.{ending}").is_file():
-                    shutil.copy(place / f"{part}.{ending}", source)
-            (source / f"points3D.{ending}").write_bytes(bytes(8) if ending == "bin" else b"")
-        model = pycolmap.Reconstruction()
-        told, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, 3  # the error says it all
-        try:
-            (model.read_binary if ending == "bin" else model.read_text)(str(source))
-        except Exception as error:  # pycolmap hands out C++ errors of many kinds for a damaged file
-            reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-            raise RecordingError(
-                f"{place}: pycolmap cannot read this model ({reason}); are cameras and images whole?"
-            ) from error
-        finally:
-            pycolmap.logging.minloglevel = told
+    model = pycolmap.Reconstruction()
+    told, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, 3  # the error says it all
+    try:
+        with tempfile.TemporaryDirectory() as scratch:
+            if ending == "bin":
+                _copy_checked(place, Path(scratch))
+                model.read_binary(scratch)
+            else:
+                for part in PARTS:
+                    if (place / f"{part}.txt").is_file():
+                        shutil.copy(place / f"{part}.txt", scratch)
+                if not (place / "points3D.txt").is_file():
+                    (Path(scratch) / "points3D.txt").touch()
+                model.read_text(scratch)
+    except (RecordingError, OSError):
+        raise
+    except Exception as error:  # pycolmap hands out C++ errors of many kinds for a damaged file
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise RecordingError(
+            f"{place}: pycolmap cannot read this model ({reason}); are cameras and images whole?"
+        ) from error
+    finally:
+        pycolmap.logging.minloglevel = told
     return model
+
+
+def _copy_checked(place: Path, scratch: Path) -> None:
+    import pycolmap
+
+    def n_parameters(model_id: int) -> int:
+        try:
+            camera = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model_id), 1.0, 2, 2)
+        except Exception:  # a C++ error of whatever kind: no such model
+            return -1
+        return len(camera.params)
+
+    (scratch / "cameras.bin").write_bytes(checked_cameras(place / "cameras.bin", n_parameters))
+    (scratch / "images.bin").write_bytes(images_without_points(place / "images.bin"))
+    (scratch / "points3D.bin").write_bytes(bytes(8))
+    for part, checked in (("rigs", checked_rigs), ("frames", checked_frames)):
+        if (place / f"{part}.bin").is_file():
+            (scratch / f"{part}.bin").write_bytes(checked(place / f"{part}.bin"))
 
 
 def _views(model: Any, place: Path) -> tuple[list[_View], int]:

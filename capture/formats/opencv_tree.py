@@ -76,7 +76,7 @@ def _matrix(value: dict[str, Any], path: Path) -> Any:
         return value
     try:
         return np.array(value["data"], dtype=np.float64).reshape([int(n) for n in shape])
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         told = " x ".join(map(str, shape))
         raise RecordingError(
             f"{path}: a matrix of {told} does not hold that many numbers ({error}); is the file whole?"
