@@ -64,7 +64,7 @@ class Boards:
     wide: bool = False
     """Lenses that bend strongly: three more distortion terms (k3 to k6 of OpenCV)."""
     every: int | None = None
-    """Look at every so many-th frame of videos; by itself at about 150 of each."""
+    """Look at every so many-th frame of videos; by itself at 60 to 150 of each."""
 
 
 def perform_boards(command: Boards) -> int:
@@ -108,7 +108,9 @@ def perform_boards(command: Boards) -> int:
         sightings = read_sightings(footage, board, every=command.every, delays=shifts)
         result = calibrate(sightings, board, known=known, wide=command.wide, extrinsics=extrinsics)
     findings = find_faults(result, delays, extrinsics=extrinsics)
-    ground = None if result.rig is None else grounded(result, footage, board, floor_key, command.floor)
+    ground = (
+        None if result.rig is None else grounded(result, footage, board, floor_key, command.floor, shifts)
+    )
     write_result(command.out, result, ground)
     told = json.dumps(report(result, findings, ground, shifts), indent=1, ensure_ascii=False)
     write_atomically(report_path(command.out), lambda path: path.write_text(told + "\n", encoding="utf-8"))
@@ -117,8 +119,9 @@ def perform_boards(command: Boards) -> int:
         print(line)
     print(f"{'rig' if ground else 'lenses'}: {command.out}   ({time.perf_counter() - started:.0f} s)")
     print(f"report: {report_path(command.out)}")
-    unasked = result.rig is None and not command.intrinsics_only
-    return FRAMES_FAILED if unasked or any(one.grave for one in findings) else OK
+    unasked = result.rig is None and extrinsics
+    doubted = ground is not None and bool(ground.doubts)
+    return FRAMES_FAILED if unasked or doubted or any(one.grave for one in findings) else OK
 
 
 def parsed_squares(text: str) -> tuple[int, int]:
@@ -184,7 +187,12 @@ def known_lenses(
 
 
 def grounded(
-    result: BoardCalibration, footage: BoardFootage, board: Board, key: str | None, floor: str
+    result: BoardCalibration,
+    footage: BoardFootage,
+    board: Board,
+    key: str | None,
+    floor: str,
+    shifts: Mapping[str, int],
 ) -> Ground:
     """The rig on its floor, as asked."""
     from capture.world_frame import Ground, ground_from_cameras
@@ -192,7 +200,7 @@ def grounded(
     rig = result.rig
     assert rig is not None
     if key is not None:
-        return ground_on_board(result, footage, board, key)
+        return ground_on_board(result, footage, board, key, shifts)
     if floor == "keep":
         return Ground(
             rig, np.eye(4), 1.0, ("World: the axes of the first camera (x right, y down, z forward).",)
@@ -200,7 +208,9 @@ def grounded(
     return ground_from_cameras(rig)
 
 
-def ground_on_board(result: BoardCalibration, footage: BoardFootage, board: Board, key: str) -> Ground:
+def ground_on_board(
+    result: BoardCalibration, footage: BoardFootage, board: Board, key: str, shifts: Mapping[str, int]
+) -> Ground:
     """The rig on the plane of a board that lay on the floor."""
     from capture.board_agreement import locate_board
     from capture.board_pictures import views_at
@@ -212,7 +222,7 @@ def ground_on_board(result: BoardCalibration, footage: BoardFootage, board: Boar
     names = result.sightings.names
     seen = {
         names.index(name): view
-        for name, view in views_at(footage, board, key).items()
+        for name, view in views_at(footage, board, key, delays=shifts).items()
         if names.index(name) in result.placed
     }
     if not seen:

@@ -53,7 +53,7 @@ def find_delay(
     step = max(1, int(np.median(np.diff(moments))))
     scores = {0.0: _misfit(0.0, views, board, lens, path)}
     for coarse in range(-most_frames, most_frames + 1, max(1, step // 2)):
-        scores[float(coarse)] = _misfit(coarse, views, board, lens, path)
+        scores[float(coarse)] = _misfit(float(coarse), views, board, lens, path)
     best = min(scores, key=lambda s: scores[s])
     for width in (1.0, 0.5, 0.25):
         for shift in (best - width, best + width):

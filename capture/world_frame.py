@@ -133,7 +133,7 @@ def ground_from_feet(rig: Rig, feet: Float[np.ndarray, "n 3"], *, above_m: float
     moved = _moved(rig, frame_at(origin, up))
     notes = [f"Floor from {len(feet)} places of feet."]
     doubts: list[str] = []
-    if spread_m < 0.25:
+    if spread_m < 0.15:
         doubts.append(
             "The feet hardly move about: the floor's tilt is mostly that of the cameras' up direction; "
             "walk around."
