@@ -23,6 +23,7 @@ from capture.board_view import BoardView
 _LEAST_VIEWS = 6
 _CORNERS_A_VIEW = 6
 _MUCH_BETTER = 0.5
+_GOOD_RAD = 0.004  # misfit that boards moving between two known moments leave, as an angle
 _WIDEST_GAP = 3  # times the usual step between moments
 
 
@@ -60,7 +61,8 @@ def find_delay(
             scores[shift] = _misfit(shift, views, board, lens, path)
         best = min(scores, key=lambda s: scores[s])
     before, after = scores[0.0], scores[best]
-    if not np.isfinite(after) or abs(best) < 0.5 or not after < _MUCH_BETTER * before:
+    good = _GOOD_RAD * lens.focal_px
+    if abs(best) < 0.5 or not after < min(_MUCH_BETTER * before, good):
         return None
     return Delay(best, before, after)
 
