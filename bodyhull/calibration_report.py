@@ -1,4 +1,4 @@
-"""What a calibration from boards tells: a table for the screen, sentences, and the same numbers for programs."""
+"""What a calibration from boards tells: a table, sentences, and the same numbers for programs."""
 
 from __future__ import annotations
 
