@@ -9,18 +9,18 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
 
+from bodyhull.calibration_report import report, table, told_lines
 from bodyhull.errors import FRAMES_FAILED, OK, UserError
 from bodyhull.folder import write_atomically
 
 if TYPE_CHECKING:
     from capture.board import Board
     from capture.board_calibration import BoardCalibration
-    from capture.board_findings import Finding
     from capture.board_intrinsics import Intrinsics
     from capture.board_pictures import BoardFootage
     from capture.world_frame import Ground
@@ -64,7 +64,12 @@ class Boards:
     wide: bool = False
     """Lenses that bend strongly: three more distortion terms (k3 to k6 of OpenCV)."""
     every: int | None = None
-    """Look at every so many-th frame of videos; by itself at about 150 of each."""
+    """Look at every so many-th frame of videos; by itself at 60 to 150 of each."""
+
+
+_MOST_SHIFTS = (
+    2  # a camera that was in the rig with a delay bends it, so that the first guess may be a frame off
+)
 
 
 def perform_boards(command: Boards) -> int:
@@ -100,15 +105,24 @@ def perform_boards(command: Boards) -> int:
     extrinsics = not command.intrinsics_only and len(footage.together) > 1
     result = calibrate(sightings, board, known=known, wide=command.wide, extrinsics=extrinsics)
     delays = find_delays(result)
+    shifts: dict[str, int] = {}
     videos = {one.name for one in footage.together if one.is_video}
-    shifts = {name: round(d.frames) for name, d in delays.items() if name in videos and round(d.frames)}
+    found = delays
+    for _ in range(_MOST_SHIFTS):
+        more = {name: round(d.frames) for name, d in found.items() if name in videos and round(d.frames)}
+        if not more:
+            break
+        shifts |= {name: shifts.get(name, 0) + shift for name, shift in more.items()}
+        sightings = read_sightings(footage, board, every=command.every, delays=shifts)
+        result = calibrate(sightings, board, known=known, wide=command.wide, extrinsics=extrinsics)
+        found = find_delays(result)
     if shifts:
         listed = ", ".join(f"{name} by {shift}" for name, shift in shifts.items())
         print(f"note: not synchronised, frames shifted and calibrated again: {listed}")
-        sightings = read_sightings(footage, board, every=command.every, delays=shifts)
-        result = calibrate(sightings, board, known=known, wide=command.wide, extrinsics=extrinsics)
     findings = find_faults(result, delays, extrinsics=extrinsics)
-    ground = None if result.rig is None else grounded(result, footage, board, floor_key, command.floor)
+    ground = (
+        None if result.rig is None else grounded(result, footage, board, floor_key, command.floor, shifts)
+    )
     write_result(command.out, result, ground)
     told = json.dumps(report(result, findings, ground, shifts), indent=1, ensure_ascii=False)
     write_atomically(report_path(command.out), lambda path: path.write_text(told + "\n", encoding="utf-8"))
@@ -117,8 +131,9 @@ def perform_boards(command: Boards) -> int:
         print(line)
     print(f"{'rig' if ground else 'lenses'}: {command.out}   ({time.perf_counter() - started:.0f} s)")
     print(f"report: {report_path(command.out)}")
-    unasked = result.rig is None and not command.intrinsics_only
-    return FRAMES_FAILED if unasked or any(one.grave for one in findings) else OK
+    unasked = result.rig is None and extrinsics
+    doubted = ground is not None and bool(ground.doubts)
+    return FRAMES_FAILED if unasked or doubted or any(one.grave for one in findings) else OK
 
 
 def parsed_squares(text: str) -> tuple[int, int]:
@@ -184,7 +199,12 @@ def known_lenses(
 
 
 def grounded(
-    result: BoardCalibration, footage: BoardFootage, board: Board, key: str | None, floor: str
+    result: BoardCalibration,
+    footage: BoardFootage,
+    board: Board,
+    key: str | None,
+    floor: str,
+    shifts: Mapping[str, int],
 ) -> Ground:
     """The rig on its floor, as asked."""
     from capture.world_frame import Ground, ground_from_cameras
@@ -192,7 +212,7 @@ def grounded(
     rig = result.rig
     assert rig is not None
     if key is not None:
-        return ground_on_board(result, footage, board, key)
+        return ground_on_board(result, footage, board, key, shifts)
     if floor == "keep":
         return Ground(
             rig, np.eye(4), 1.0, ("World: the axes of the first camera (x right, y down, z forward).",)
@@ -200,7 +220,9 @@ def grounded(
     return ground_from_cameras(rig)
 
 
-def ground_on_board(result: BoardCalibration, footage: BoardFootage, board: Board, key: str) -> Ground:
+def ground_on_board(
+    result: BoardCalibration, footage: BoardFootage, board: Board, key: str, shifts: Mapping[str, int]
+) -> Ground:
     """The rig on the plane of a board that lay on the floor."""
     from capture.board_agreement import locate_board
     from capture.board_pictures import views_at
@@ -212,7 +234,7 @@ def ground_on_board(result: BoardCalibration, footage: BoardFootage, board: Boar
     names = result.sightings.names
     seen = {
         names.index(name): view
-        for name, view in views_at(footage, board, key).items()
+        for name, view in views_at(footage, board, key, delays=shifts).items()
         if names.index(name) in result.placed
     }
     if not seen:
@@ -247,132 +269,3 @@ def write_result(out: Path, result: BoardCalibration, ground: Ground | None) -> 
         if one is not None
     ]
     write_atomically(out, lambda path: save_lenses(path, lenses))
-
-
-# -- telling -----------------------------------------------------------------------------------------------
-
-
-def rows_of(result: BoardCalibration) -> list[dict[str, Any]]:
-    """One row of numbers a camera; None where there is none."""
-    shared = set(result.sightings.shared_moments())
-    agreement = result.agreement
-    rows = []
-    for c, name in enumerate(result.sightings.names):
-        lens = result.intrinsics[c]
-        rows.append(
-            {
-                "camera": name,
-                "size": list(result.sightings.sizes[c]),
-                "placed": c in result.placed,
-                "boards": len(result.sightings.of(c)),
-                "shared_boards": len(shared & result.sightings.views[c].keys()),
-                "focal_px": _number(None if lens is None else lens.focal_px),
-                "focal_sd_px": _number(None if lens is None else lens.focal_sd_px),
-                "rms_px": _number(result.rms_px[c]),
-                "held_out_corners_px": _number(None if agreement is None else agreement.corners_px[c]),
-                "held_out_boards_px": _number(None if agreement is None else agreement.boards_px[c]),
-                "coverage": _number(None if lens is None else lens.coverage),
-                "edge_px": _number(None if lens is None else lens.edge_px),
-            }
-        )
-    return rows
-
-
-def _number(value: float | None) -> float | None:
-    return None if value is None or not np.isfinite(value) else float(value)
-
-
-_COLUMNS: tuple[tuple[str, str, str], ...] = (
-    ("camera", "camera", ""),
-    ("boards", "boards", "d"),
-    ("shared", "shared_boards", "d"),
-    ("focal px", "focal_px", ".1f"),
-    ("+-", "focal_sd_px", ".1f"),
-    ("rms px", "rms_px", ".2f"),
-    ("held out px", "held_out_boards_px", ".3f"),
-    ("corners px", "held_out_corners_px", ".2f"),
-    ("covered", "coverage", ".0%"),
-    ("edge px", "edge_px", ".1f"),
-)
-
-
-def table(result: BoardCalibration) -> str:
-    """The report for the screen."""
-    cells = [[heading for heading, _, _ in _COLUMNS]]
-    for row in rows_of(result):
-        cells.append([_cell(row[key], form) for _, key, form in _COLUMNS])
-    widths = [max(len(line[k]) for line in cells) for k in range(len(_COLUMNS))]
-    return "\n".join(
-        "  ".join(
-            text.ljust(width) if k == 0 else text.rjust(width)
-            for k, (text, width) in enumerate(zip(line, widths, strict=True))
-        )
-        for line in cells
-    )
-
-
-def _cell(value: Any, form: str) -> str:
-    return "-" if value is None else format(value, form)
-
-
-def told_lines(
-    result: BoardCalibration, findings: Sequence[Finding], ground: Ground | None, extrinsics: bool
-) -> list[str]:
-    """What the numbers mean, a line each."""
-    lines = []
-    if result.agreement is not None:
-        lines.append(
-            f"Cameras agree to {result.agreement.overall_px:.3f} px inside the volume, on boards held "
-            "out of the fit."
-        )
-    elif result.rig is not None:
-        lines.append(
-            "Too few shared boards to hold some out: the residuals are of the boards that were fitted."
-        )
-    if result.dropped:
-        views = ", ".join(
-            f"{result.sightings.names[c]} {result.sightings.labels.get(m, str(m))}"
-            for c, m in result.dropped[:6]
-        )
-        more = f" and {len(result.dropped) - 6} more" if len(result.dropped) > 6 else ""
-        lines.append(f"Left out, as they fit nothing: {views}{more}.")
-    if result.rig is None:
-        if extrinsics:
-            lines.append(
-                "No extrinsics: no two cameras saw the board in one place at one moment (same picture "
-                "name or frame "
-                "number). The lenses are written; film the board with all cameras at once, then add "
-                "--lenses FILE."
-            )
-        else:
-            lines.append("Lenses only, without places: give them to the next calibration with --lenses FILE.")
-    if ground is not None:
-        lines += [f"World: {note}" for note in ground.notes]
-        lines += [f"warning: {doubt}" for doubt in ground.doubts]
-    lines += [("BAD " if one.grave else "warning: ") + one.sentence for one in findings]
-    return lines
-
-
-def report(
-    result: BoardCalibration,
-    findings: Sequence[Finding],
-    ground: Ground | None,
-    shifts: Mapping[str, int],
-) -> dict[str, Any]:
-    """The report for programs."""
-    return {
-        "board": result.board.sentence(),
-        "start": result.method,
-        "agreement_px": _number(None if result.agreement is None else result.agreement.overall_px),
-        "cameras": rows_of(result),
-        "findings": [
-            {"camera": one.camera, "kind": one.kind, "grave": one.grave, "sentence": one.sentence}
-            for one in findings
-        ],
-        "frame_shifts": dict(shifts),
-        "world": None if ground is None else [*ground.notes, *ground.doubts],
-        "left_out": [
-            {"camera": result.sightings.names[c], "moment": result.sightings.labels.get(m, str(m))}
-            for c, m in result.dropped
-        ],
-    }

@@ -77,7 +77,12 @@ def perform_world(command: World) -> int:
         else []
     )
     ground = settle_ground(
-        recording.calibration, command.floor, joints=joints, masks=masks, height_m=command.height_m
+        recording.calibration,
+        command.floor,
+        joints=joints,
+        masks=masks,
+        height_m=command.height_m,
+        up=recording.up,
     )
     write_atomically(command.out, ground.rig.save)
     for note in ground.notes:

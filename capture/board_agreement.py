@@ -3,7 +3,9 @@
 For each held-out board and each camera that saw it, the other cameras say where the board is and so where
 its corners should be in this one. Corners that were found imprecisely scatter about that; a rig that is off
 shifts, turns and scales the whole board. So two numbers: the distance of the corners (which the detector's
-noise is part of), and that of the board as a whole, from which the noise is averaged away.
+noise is part of), and that of the board as a whole, from which most of the noise is averaged away; what
+noise must be left there, with few cameras to say where the board is, is known from the corners' own scatter
+and taken off.
 """
 
 from __future__ import annotations
@@ -27,24 +29,21 @@ class Agreement:
     """On held-out boards, by camera (C), px RMS; NaN for a camera that saw none of them with another.
 
     corners_px: of single corners, noise included; boards_px: of whole boards (their affine motion in the
-    picture). n_boards: (C) held-out boards that the camera saw with others.
+    picture), the corners' noise taken off; overall_px: that over all cameras. n_boards: (C) held-out boards
+    that the camera saw with others.
     """
 
     corners_px: Float[np.ndarray, " c"]
     boards_px: Float[np.ndarray, " c"]
+    overall_px: float
     n_boards: tuple[int, ...]
-
-    @property
-    def overall_px(self) -> float:
-        """RMS over cameras of `boards_px`; NaN where there is none."""
-        known = self.boards_px[np.isfinite(self.boards_px)]
-        return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
 
 
 def held_out_agreement(
-    sightings: Sightings, board: Board, held: Sequence[int], adjusted: Adjusted
+    sightings: Sightings, board: Board, held: Sequence[int], adjusted: Adjusted, scatter: float
 ) -> Agreement:
-    """Agreement of the adjusted cameras on these moments."""
+    """Agreement of the adjusted cameras on these moments. scatter: of corners, px, standard deviation of u
+    and of v."""
     n = sightings.n_cameras
     corners: list[list[float]] = [[] for _ in range(n)]
     boards: list[list[float]] = [[] for _ in range(n)]
@@ -58,8 +57,8 @@ def held_out_agreement(
         if whole is None:
             continue
         parts = _normal_parts(whole, seen, board, adjusted.intrinsics, adjusted.camera_from_rig)
-        matrix = sum(part.matrix for part in parts.values())
-        vector = sum(part.vector for part in parts.values())
+        matrix = np.sum([part.matrix for part in parts.values()], axis=0)
+        vector = np.sum([part.vector for part in parts.values()], axis=0)
         for c, view in seen.items():
             # Where the board is without this camera: a Newton step from where it is with all.
             step = np.linalg.lstsq(matrix - parts[c].matrix, vector - parts[c].vector)[0]
@@ -67,18 +66,39 @@ def held_out_agreement(
             assert one is not None
             off = residuals_px(view, board, one, adjusted.camera_from_rig[c] @ _stepped(whole, step))
             corners[c].append(float(np.mean(np.sum(off**2, axis=1))))
-            boards[c].append(float(np.mean(np.sum(_affine_part(view, off) ** 2, axis=1))))
+            noise = _expected_square(view, parts[c], matrix - parts[c].matrix) * scatter**2
+            boards[c].append(float(np.mean(np.sum(_affine_part(view, off) ** 2, axis=1))) - noise)
+
+    def root(values: list[float]) -> float:
+        return float(np.sqrt(max(float(np.mean(values)), 0.0))) if values else float("nan")
+
     return Agreement(
-        np.array([np.sqrt(np.mean(v)) if v else np.nan for v in corners]),
-        np.array([np.sqrt(np.mean(v)) if v else np.nan for v in boards]),
-        tuple(len(v) for v in boards),
+        np.array([root(values) for values in corners]),
+        np.array([root(values) for values in boards]),
+        root([value for values in boards for value in values]),
+        tuple(len(values) for values in boards),
     )
+
+
+def _affine_space(view: BoardView) -> Float[np.ndarray, "n 3"]:
+    """Orthonormal basis (N 3) of what a shift, a turn or a stretch does to one coordinate of the corners."""
+    design = np.column_stack([np.ones(len(view)), view.pixels - view.pixels.mean(axis=0)])
+    return np.linalg.qr(design)[0]
+
+
+def _expected_square(view: BoardView, part: _NormalPart, rest: Float[np.ndarray, "6 6"]) -> float:
+    """Mean square of the affine part where corners scatter by one pixel: this view's own, and that of the
+    board's pose as the rest tells it (their normal matrix, 6 6)."""
+    basis = _affine_space(view)
+    moved = np.stack([basis.T @ part.jacobian[k::2] for k in (0, 1)])
+    pose = np.linalg.pinv(rest)
+    return float(6 + np.einsum("aij,jk,aik->", moved, pose, moved)) / len(view)
 
 
 def _affine_part(view: BoardView, off: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     """What of these residuals is a shift, a turn or a stretch of the whole board."""
-    design = np.column_stack([np.ones(len(view)), view.pixels - view.pixels.mean(axis=0)])
-    return design @ np.linalg.lstsq(design, off)[0]
+    basis = _affine_space(view)
+    return basis @ (basis.T @ off)
 
 
 def locate_board(
@@ -103,8 +123,8 @@ def locate_board(
     pose, best = options[int(np.argmin(costs))], float(min(costs))
     for _ in range(10):
         parts = _normal_parts(pose, seen, board, intrinsics, camera_from_rig)
-        matrix = sum(part.matrix for part in parts.values())
-        vector = sum(part.vector for part in parts.values())
+        matrix = np.sum([part.matrix for part in parts.values()], axis=0)
+        vector = np.sum([part.vector for part in parts.values()], axis=0)
         stepped = _stepped(pose, np.linalg.lstsq(matrix, vector)[0])
         cost = _cost(stepped, seen, board, intrinsics, camera_from_rig)
         if cost < best:
@@ -117,8 +137,10 @@ def locate_board(
 
 @dataclass(frozen=True, eq=False)
 class _NormalPart:
-    """One camera's share of the normal equations of a board's pose: matrix (6 6), vector (6)."""
+    """One camera's share of the normal equations of a board's pose: matrix (6 6), vector (6); jacobian (2N
+    6)."""
 
+    jacobian: Float[np.ndarray, "m 6"]
     matrix: Float[np.ndarray, "6 6"]
     vector: Float[np.ndarray, " 6"]
 
@@ -144,7 +166,7 @@ def _normal_parts(
             ],
             axis=1,
         )
-        parts[c] = _NormalPart(jacobian.T @ jacobian, -jacobian.T @ off)
+        parts[c] = _NormalPart(jacobian, jacobian.T @ jacobian, -jacobian.T @ off)
     return parts
 
 

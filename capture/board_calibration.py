@@ -105,7 +105,12 @@ def calibrate(
     if held:
         kept = [m for m in start.rig_from_board if m not in set(held)]
         first = adjust(_at(start, kept), board, intrinsics, lone, fixed_intrinsics=fixed)
-        agreement = held_out_agreement(start.sightings, board, held, first)
+        fitted = replace(
+            _at(start, kept), camera_from_rig=first.camera_from_rig, rig_from_board=first.rig_from_board
+        )
+        # Of distances, half the square is in u and half in v.
+        scatter = float(np.nanmedian(fit_rms(fitted, board, first.intrinsics))) / np.sqrt(2)
+        agreement = held_out_agreement(start.sightings, board, held, first, float(scatter))
         intrinsics = list(first.intrinsics)
         start = _moved(start, first, board)
     adjusted = adjust(start, board, intrinsics, lone, fixed_intrinsics=fixed)

@@ -33,6 +33,7 @@ _FAMILIES = (
     "DICT_APRILTAG_36H11",
 )
 _N_FOR_MARKERS = 5  # pictures in which all dictionaries are looked for
+_N_SURE = 3  # pictures that show the same, to believe it
 _SQUARE_PX = 50.0  # large enough for the smallest bits
 _LEAST_MARKERS = 4  # in one picture, to believe in a ChArUco board
 
@@ -111,7 +112,12 @@ def _choose_checkerboard(pictures: Sequence[Grey], wish: BoardWish, notes: list[
 
 
 def _count_views(pictures: Sequence[Grey], board: Board) -> int:
-    quick = sum(find_board(picture, board, thorough=False) is not None for picture in pictures)
+    """In how many of the pictures the board is found; no more than `_N_SURE` are counted."""
+    quick = 0
+    for picture in pictures:
+        quick += find_board(picture, board, thorough=False) is not None
+        if quick == _N_SURE:
+            break
     if quick:
         return quick
     # The thorough search takes a second a picture: some will do.
@@ -177,17 +183,23 @@ def _board_parts(pictures: Sequence[Grey], wish: BoardWish) -> list[Grey]:
     """The part of each picture where a checkerboard of the wished size was found at once, else the whole
     picture.
 
-    A ChArUco board is a checkerboard too, so its markers lie there; parts come first.
+    A ChArUco board is a checkerboard too, so its markers lie there. Nothing, where white squares are empty.
     """
     parts: list[Grey] = []
     whole: list[Grey] = []
     shape = (wish.columns - 1, wish.rows - 1)
+    n_plain = 0
     for picture in pictures:
         found, corners = cv2.findChessboardCorners(picture, shape, flags=cv2.CALIB_CB_FAST_CHECK)
         if not found:
             whole.append(picture)
             continue
         corners = corners.reshape(-1, 2)
+        if wish.kind == "auto" and wish.dictionary == "auto" and _is_plain(picture, corners, shape):
+            n_plain += 1
+            if n_plain == _N_SURE:
+                return []
+            continue
         margin = 2 * np.ptp(corners, axis=0).max() / min(shape)
         low = np.maximum(corners.min(axis=0) - margin, 0).astype(int)
         high = (corners.max(axis=0) + margin).astype(int)
@@ -199,7 +211,22 @@ def _board_parts(pictures: Sequence[Grey], wish: BoardWish) -> list[Grey]:
         parts.append(part)
         if len(parts) == _N_FOR_MARKERS:
             break
-    return parts or whole
+    return parts or ([] if n_plain else whole)
+
+
+def _is_plain(picture: Grey, corners: Float[np.ndarray, "n 2"], shape: tuple[int, int]) -> bool:
+    """Whether all squares between these inner corners are of one brightness each: no markers in the white
+    ones."""
+    across, down = shape
+    px = 16
+    grid = np.stack(np.meshgrid(np.arange(across), np.arange(down)), axis=-1).reshape(-1, 2) * float(px)
+    homography, _ = cv2.findHomography(corners.astype(np.float64), grid, 0)
+    if homography is None:
+        return False
+    flat = cv2.warpPerspective(picture, homography, ((across - 1) * px, (down - 1) * px)).astype(np.float64)
+    cells = flat.reshape(down - 1, px, across - 1, px).transpose(0, 2, 1, 3)[:, :, 4:-4, 4:-4]
+    contrast = float(np.quantile(flat, 0.95) - np.quantile(flat, 0.05))
+    return bool(np.quantile(cells.std(axis=(2, 3)), 0.9) < 0.12 * max(contrast, 1.0))
 
 
 def _n_telling(ids: list[int], n_markers: int) -> int:

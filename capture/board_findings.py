@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture.board_calibration import BoardCalibration
+from capture.board_mirror import shared_when_flipped
 from capture.board_sync import Delay, find_delay
 
 _FEW_VIEWS = 8
@@ -173,11 +174,20 @@ def _of_rig(result: BoardCalibration, delays: dict[str, Delay]) -> list[Finding]
         if n_shared == 0:
             text = f"{group[0]}: shares no board with another camera; show the board where one sees it too"
             found.append(Finding(group[0], "unconnected", text, True))
+            continue
+        flipped = shared_when_flipped(result.sightings, result.board, result.intrinsics, c, result.placed)
+        if flipped is not None:
+            text = (
+                f"{group[0]}: its pictures are mirrored (flipped, {flipped[0]} of {flipped[1]} boards "
+                "agree with "
+                "another camera's); switch mirroring off, or flip them, and calibrate again"
+            )
+            found.append(Finding(group[0], "mirrored", text, True))
         else:
             text = (
                 f"{group[0]}: its boards contradict the other cameras' (no common pose in up to "
                 f"{n_shared} shared boards): "
-                "not synchronised, mirrored pictures, moved, or same names for different moments"
+                "not synchronised, moved, or same names for different moments"
             )
             found.append(Finding(group[0], "contradicts", text, True))
     usual = float(np.nanmedian(result.rms_px))

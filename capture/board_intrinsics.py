@@ -21,6 +21,7 @@ _N_VIEWS = 20
 _LEAST_VIEWS = 3
 _FULL_MODEL_VIEWS = 5  # fewer leave the principal point where most cameras have it: in the middle
 _SURE_PRINCIPAL_POINT = 0.04  # of the picture's width: a standard deviation beyond that is no knowledge
+_UNSURE_FOCAL = 0.03  # of the focal length: the same
 _GRID = 10
 
 
@@ -68,9 +69,10 @@ def find_intrinsics(
     if result is None:
         return None
     if not flags & cv2.CALIB_FIX_PRINCIPAL_POINT:
-        spread = result.deviations[2:4].max()
-        if not spread < _SURE_PRINCIPAL_POINT * max(size):
-            flags |= cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO
+        spread = float(result.deviations[2:4].max())
+        unsure = float(result.deviations[:2].max()) > _UNSURE_FOCAL * result.matrix[0, 0]
+        if unsure or not spread < _SURE_PRINCIPAL_POINT * max(size):
+            flags |= cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST
             again = _solved(chosen, board, size, flags)
             notes.append("views too alike to tell the principal point: assumed in the middle of the picture")
             result = again or result

@@ -30,6 +30,8 @@ from capture.video_file import VideoFile
 PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v")
 _MOST_FRAMES = 150  # of a video that are looked at, where it is not said
+_FEWEST_FRAMES = 60
+_ALL_FRAMES = 1500  # of all videos together, as long as that leaves each its fewest
 _N_SAMPLES = 16  # pictures to tell the board by
 
 Grey = UInt8[np.ndarray, "h w"]
@@ -192,7 +194,7 @@ def read_sightings(
 ) -> Sightings:
     """Find the board in all pictures, several cameras at once.
 
-    every: look at each so many-th frame of a video; by itself, at about 150 of them. delays: frames by which
+    every: look at each so many-th frame of a video; by itself, at 60 to 150 of them. delays: frames by which
     a camera's video runs late: its frame number less the delay is the moment. Raises RecordingError for an
     unusable value.
     """
@@ -232,7 +234,9 @@ def read_sightings(
 def video_step(footage: BoardFootage) -> int:
     """Every how manieth frame is looked at, where it is not said."""
     longest = max((one.n_frames for one in (*footage.together, *footage.alone)), default=0)
-    return max(1, longest // _MOST_FRAMES)
+    n_videos = sum(one.is_video for one in (*footage.together, *footage.alone))
+    wanted = int(np.clip(_ALL_FRAMES // max(n_videos, 1), _FEWEST_FRAMES, _MOST_FRAMES))
+    return max(1, longest // wanted)
 
 
 def moment_numbers(together: Sequence[Footage]) -> dict[str, int]:
@@ -279,7 +283,9 @@ def _frames(one: Footage, wanted: Sequence[int]) -> Iterator[tuple[int, Grey]]:
             yield frame, cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.uint8, copy=False)
 
 
-def views_at(footage: BoardFootage, board: Board, key: str) -> dict[str, BoardView]:
+def views_at(
+    footage: BoardFootage, board: Board, key: str, *, delays: Mapping[str, int] | None = None
+) -> dict[str, BoardView]:
     """The board at one moment, searched for thoroughly: camera -> view. key: a picture's name or a video's
     frame number.
 
@@ -289,7 +295,8 @@ def views_at(footage: BoardFootage, board: Board, key: str) -> dict[str, BoardVi
     n_have = 0
     for one in footage.together:
         if one.is_video:
-            wanted = [int(key)] if key.isdecimal() and int(key) < one.n_frames else []
+            frame = int(key) + (delays or {}).get(one.name, 0) if key.isdecimal() else -1
+            wanted = [frame] if 0 <= frame < one.n_frames else []
             pictures = [grey for _, grey in _frames(one, wanted)]
         else:
             path = one.files.get(moment_key(key, one.name))

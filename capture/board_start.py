@@ -18,7 +18,7 @@ from itertools import combinations
 import cv2
 import numpy as np
 from jaxtyping import Float
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, sparray
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from capture.board import Board
@@ -69,7 +69,7 @@ def start_rig(
         {} if known is None else {m: board_poses(view, board, known) for m, view in views.items()}
         for views, known in zip(sightings.views, intrinsics, strict=True)
     ]
-    relative, pairs = _pair_poses(candidates)
+    relative, pairs = pair_poses(candidates)
     n = sightings.n_cameras
     if not relative:
         return None
@@ -124,7 +124,7 @@ def board_poses(view: BoardView, board: Board, known: Intrinsics) -> list[_Candi
     return out
 
 
-def _pair_poses(
+def pair_poses(
     candidates: Sequence[Mapping[int, list[_Candidate]]],
 ) -> tuple[dict[tuple[int, int], Pose], dict[tuple[int, int], tuple[int, int]]]:
     """(first, second) -> second_from_first that most shared boards agree on; and how many do, of how many."""
@@ -178,7 +178,7 @@ def mean_pose(poses: Float[np.ndarray, "n 4 4"]) -> Pose:
     return out
 
 
-def _chained(root: int, tree: coo_array, relative: Mapping[tuple[int, int], Pose]) -> dict[int, Pose]:
+def _chained(root: int, tree: sparray, relative: Mapping[tuple[int, int], Pose]) -> dict[int, Pose]:
     order, before = breadth_first_order(tree + tree.T, root, directed=False)
     placed = {root: np.eye(4)}
     for camera_idx in order[1:]:

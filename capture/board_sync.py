@@ -23,6 +23,7 @@ from capture.board_view import BoardView
 _LEAST_VIEWS = 6
 _CORNERS_A_VIEW = 6
 _MUCH_BETTER = 0.5
+_GOOD_RAD = 0.004  # misfit that boards moving between two known moments leave, as an angle
 _WIDEST_GAP = 3  # times the usual step between moments
 
 
@@ -53,14 +54,15 @@ def find_delay(
     step = max(1, int(np.median(np.diff(moments))))
     scores = {0.0: _misfit(0.0, views, board, lens, path)}
     for coarse in range(-most_frames, most_frames + 1, max(1, step // 2)):
-        scores[float(coarse)] = _misfit(coarse, views, board, lens, path)
+        scores[float(coarse)] = _misfit(float(coarse), views, board, lens, path)
     best = min(scores, key=lambda s: scores[s])
     for width in (1.0, 0.5, 0.25):
         for shift in (best - width, best + width):
             scores[shift] = _misfit(shift, views, board, lens, path)
         best = min(scores, key=lambda s: scores[s])
     before, after = scores[0.0], scores[best]
-    if not np.isfinite(after) or abs(best) < 0.5 or not after < _MUCH_BETTER * before:
+    good = _GOOD_RAD * lens.focal_px
+    if abs(best) < 0.5 or not after < min(_MUCH_BETTER * before, good):
         return None
     return Delay(best, before, after)
 

@@ -83,6 +83,11 @@ class Rig:
             raise RecordingError(f"{path}: cannot be read ({error.strerror})") from error
         except ValueError as error:
             raise RecordingError(f"{path}: not a JSON file ({error})") from error
+        if isinstance(content, dict) and content.get("format") == "bodyhull-lenses":
+            raise RecordingError(
+                f"{path}: holds lenses without places, no rig; film a board with all cameras at once and run "
+                f"bodyhull calibrate boards with --lenses {path}"
+            )
         if not isinstance(content, dict) or content.get("format") != _FORMAT:
             raise RecordingError(f'{path}: a JSON file, but no rig of ours (expected "format": "{_FORMAT}")')
         if content.get("version") != _VERSION:

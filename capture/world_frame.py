@@ -29,6 +29,9 @@ _ANKLES = (11, 14)
 _ANKLE_M = 0.08
 _SOLE_M = 0.02  # toes' and heels' keypoints lie inside the foot
 
+_UPRIGHT_RAD = 0.03  # beyond that most cameras are rolled: only their mean up direction tells something
+_NEAR_UP_DEG = 20.0
+
 Pose = Float[np.ndarray, "4 4"]
 
 
@@ -62,17 +65,20 @@ def ground_from_cameras(rig: Rig) -> Ground:
 
 
 def up_of_cameras(rig: Rig) -> Float[np.ndarray, " 3"]:
-    """Unit up direction (3) at right angles to the cameras' x axes; single tilted cameras count little."""
+    """Unit up direction (3): at right angles to the cameras' x axes, single rolled cameras counting little;
+    or, where most are rolled, where their upper edges point on average.
+    """
     right = np.array([camera.camera_from_world[0, :3] for camera in rig])
     mean = np.mean([camera.up for camera in rig], axis=0)
     up = mean / max(float(np.linalg.norm(mean)), 1e-9)
     if len(rig) < 3 or np.linalg.svd(right, compute_uv=False)[1] < 0.3:
         return up  # parallel x axes leave a turn about them open
-    weight = np.ones(len(rig))
-    for _ in range(20):
-        _, _, axes = np.linalg.svd(right * weight[:, None] ** 0.5)
-        axis = axes[-1]
+    axis = up
+    for _ in range(30):
         weight = 1 / np.maximum(np.abs(right @ axis), 0.005)
+        axis = np.linalg.eigh((right * weight[:, None]).T @ right)[1][:, 0]
+    if np.quantile(np.abs(right @ axis), 0.7) > _UPRIGHT_RAD:
+        return up
     return axis if axis @ mean > 0 else -axis
 
 
@@ -115,11 +121,18 @@ def ground_from_board(
     return replace(moved, notes=tuple(notes), doubts=tuple(doubts))
 
 
-def ground_from_feet(rig: Rig, feet: Float[np.ndarray, "n 3"], *, above_m: float = 0.0) -> Ground:
+def ground_from_feet(
+    rig: Rig,
+    feet: Float[np.ndarray, "n 3"],
+    *,
+    up: Float[np.ndarray, " 3"] | None = None,
+    above_m: float = 0.0,
+) -> Ground:
     """The floor is the plane under the places (N 3, the rig's world, metres) where feet stood.
 
     above_m: how far above the floor such a place lies when the foot stands. Places on a line leave a tilt
-    about it open; there, the cameras' up direction holds. Raises RecordingError for fewer than five places.
+    about it open; there, `up` holds (the cameras', if not given). Raises RecordingError for fewer than five
+    places.
     """
     feet = feet[np.isfinite(feet).all(axis=1)]
     if len(feet) < 5:
@@ -127,16 +140,15 @@ def ground_from_feet(rig: Rig, feet: Float[np.ndarray, "n 3"], *, above_m: float
             f"--floor feet: the feet were found in {len(feet)} frames only; take more frames, or "
             "--floor cameras"
         )
-    up, level, spread_m = _floor_plane(feet, up_of_cameras(rig))
+    up, level, spread_m = _floor_plane(feet, up_of_cameras(rig) if up is None else up)
     origin = np.median(feet, axis=0)
     origin = origin - up * (origin @ up - level + above_m)
     moved = _moved(rig, frame_at(origin, up))
     notes = [f"Floor from {len(feet)} places of feet."]
     doubts: list[str] = []
-    if spread_m < 0.25:
-        doubts.append(
-            "The feet hardly move about: the floor's tilt is mostly that of the cameras' up direction; "
-            "walk around."
+    if spread_m < 0.15:
+        notes.append(
+            "The feet hardly move about: the floor's tilt is that of the up axis as it was; walk about."
         )
     heights = feet @ moved.world_from_before[2, :3] + moved.world_from_before[2, 3]
     under = float((heights < above_m - 0.1).mean())
@@ -177,19 +189,23 @@ def settle_ground(
     joints: Sequence[Float[np.ndarray, "25 4"]] = (),
     masks: Sequence[Masks] = (),
     height_m: float | None = None,
+    up: Float[np.ndarray, " 3"] | None = None,
 ) -> Ground:
     """Scale and floor of a rig from what a recording holds.
 
     rig: as filmed or pinholes, in any unit if `height_m` is given, else metres. floor: "keep", "cameras" or
     "feet". joints: triangulated keypoints by frame (`capture.keypoints.triangulate_keypoints`), in the rig's
     world; used for feet where given. masks: frames of undistorted silhouettes, one a camera: used for feet
-    without joints, and for the height. Raises RecordingError where what was asked cannot be told.
+    without joints, and for the height. up: the world's up direction as known so far; for feet it holds where
+    it is within 20 degrees of the cameras'. Raises RecordingError where what was asked cannot be told.
     """
     if floor not in ("keep", "cameras", "feet"):
         raise RecordingError(f"--floor {floor}: unknown; choose keep, cameras or feet")
     scale = 1.0
     notes: list[str] = []
-    up = up_of_cameras(rig)
+    of_cameras = up_of_cameras(rig)
+    near = up is not None and float(up @ of_cameras) > np.cos(np.radians(_NEAR_UP_DEG))
+    up = up if near and up is not None else of_cameras
     if height_m is not None:
         if not masks:
             raise RecordingError("--height-m: needs silhouettes of the person to measure")
@@ -207,13 +223,13 @@ def settle_ground(
         ground = ground_from_cameras(rig)
     elif len(joints):
         places, above_m = feet_of_joints(joints, up)
-        ground = ground_from_feet(rig, places * scale, above_m=above_m)
+        ground = ground_from_feet(rig, places * scale, up=up, above_m=above_m)
     else:
         if not masks:
             raise RecordingError("--floor feet: needs keypoints or silhouettes")
         found = [lowest_place(rig, frame, up) for frame in masks]
         places = np.array([place for place in found if place is not None]).reshape(-1, 3)
-        ground = ground_from_feet(rig, places)
+        ground = ground_from_feet(rig, places, up=up)
     return replace(ground, scale=scale, notes=(*notes, *ground.notes))
 
 
@@ -254,7 +270,7 @@ def _floor_plane(
     standing feet.
 
     Lifted feet lie above the plane: residuals above count less than those below. The tilt is held to the
-    cameras' up direction by as much as they are trusted (one degree against a centimetre of scatter).
+    cameras' up direction (one degree) against the scatter of the feet (a centimetre at least).
     """
     x = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     x /= np.linalg.norm(x)
@@ -263,12 +279,14 @@ def _floor_plane(
     a, b, h = (feet - middle) @ x, (feet - middle) @ y, (feet - middle) @ up
     weight = np.ones(len(feet))
     slope = np.zeros(3)
+    scatter_m = 0.03
     for _ in range(30):
         design = np.column_stack([a, b, np.ones(len(feet))])
-        matrix = design.T @ (design * weight[:, None]) / 0.01**2
+        matrix = design.T @ (design * weight[:, None]) / scatter_m**2
         matrix[:2, :2] += np.eye(2) / np.radians(1.0) ** 2
-        slope = np.linalg.solve(matrix, design.T @ (weight * h) / 0.01**2)
+        slope = np.linalg.solve(matrix, design.T @ (weight * h) / scatter_m**2)
         off = h - design @ slope
+        scatter_m = max(0.01, float(np.median(np.abs(off))))
         weight = 1 / np.maximum(np.where(off > 0, 3 * off, -off), 0.01)
         weight /= weight.max()
     normal = up - slope[0] * x - slope[1] * y

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -70,11 +70,7 @@ def film_board(
     inside = cv2.warpPerspective(np.ones_like(printed, np.float32), to_canvas, canvas)
     canvas_picture = np.where(inside > 0.99, 20 + 0.8 * drawn, background).astype(np.float32)
     canvas_picture = cv2.GaussianBlur(canvas_picture, (0, 0), 0.5 * fine)
-    pixels = (
-        np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(np.float64)
-    )
-    straight = camera.undistort(pixels)
-    source = (straight + np.array([0.15 * width, 0.15 * height])) * fine + (fine - 1) / 2
+    source = (_straight_pixels(camera) + np.array([0.15 * width, 0.15 * height])) * fine + (fine - 1) / 2
     source = source.reshape(height, width, 2).astype(np.float32)
     picture = cv2.remap(canvas_picture, source[..., 0], source[..., 1], cv2.INTER_LINEAR)
     if blur_px > 0:
@@ -83,16 +79,29 @@ def film_board(
     return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
 
 
+@lru_cache(maxsize=32)
+def _straight_pixels(camera: Camera) -> np.ndarray:
+    """Where a camera without the lens sees what this one sees at each of its pixels (N 2), row by row."""
+    width, height = camera.size
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
+    return camera.undistort(pixels.astype(np.float64))
+
+
 def ring(
-    n_cameras: int, size: tuple[int, int] = (800, 600), *, focal: float = 780.0, distance_m: float = 2.4
+    n_cameras: int,
+    size: tuple[int, int] = (640, 480),
+    *,
+    focal: float = 620.0,
+    distance_m: float = 2.0,
+    height_m: float = 1.3,
+    aim_m: float = 1.0,
 ) -> Rig:
-    """Cameras with lenses on an arc of a ring, aimed at a place 1 m above the floor; each somewhat
-    different."""
+    """Cameras with lenses on an arc of a ring, aimed at a place above the floor; each somewhat different."""
     cameras = []
     for k in range(n_cameras):
         angle = 2 * np.pi * k / max(n_cameras, 8)
-        centre = np.array([distance_m * np.cos(angle), distance_m * np.sin(angle), 1.3 + 0.3 * (k % 2)])
-        pose = look_at(centre, np.array([0.0, 0, 1.0]), np.array([0.0, 0, 1]))
+        centre = np.array([distance_m * np.cos(angle), distance_m * np.sin(angle), height_m + 0.3 * (k % 2)])
+        pose = look_at(centre, np.array([0.0, 0, aim_m]), np.array([0.0, 0, 1]))
         f = focal * (1 + 0.01 * ((3 * k) % 5 - 2))
         intrinsics = np.array(
             [
@@ -104,13 +113,6 @@ def ring(
         distortion = np.array([-0.12 + 0.01 * (k % 3), 0.08, 4e-4, -3e-4])
         cameras.append(Camera(f"cam{k + 1}", size, intrinsics, pose, distortion))
     return Rig(tuple(cameras))
-
-
-@dataclass(frozen=True)
-class Poses:
-    """Where a board is held: world_from_board (4 4) a moment."""
-
-    world_from_board: list[np.ndarray]
 
 
 def held_board(

@@ -1,4 +1,5 @@
-"""Boards drawn through lenses: every kind and layout is told and its corners are found to a fraction of a pixel."""
+"""Boards drawn through lenses: every kind and layout is told and its corners are found to a fraction of a
+pixel."""
 
 import cv2
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from capture.board import Board
 from capture.board_choice import BoardWish, choose_board
 from capture.board_detection import find_board
+from capture.board_mirror import flipped_back
 from capture.errors import RecordingError
 from tests.board_scenes import CHARUCO, CHECKERBOARD, LEGACY, film_board, held_board, ring
 
@@ -110,6 +112,16 @@ def test_a_wrong_dictionary_is_told_with_the_one_that_is_seen() -> None:
 def test_a_mirrored_charuco_board_is_no_board() -> None:
     picture, _ = pictures_of(CHARUCO, 1)[0]
     assert find_board(cv2.flip(picture, 1), CHARUCO) is None
+
+
+@pytest.mark.parametrize("board", [CHECKERBOARD, Board("checkerboard", 8, 5, 0.1)], ids=["9x6", "8x5"])
+def test_a_mirrored_checkerboard_is_counted_as_is_undone_by_flipping_back(board: Board) -> None:
+    picture, _ = pictures_of(board, 1)[0]
+    straight, mirrored = find_board(picture, board), find_board(cv2.flip(picture, 1), board)
+    assert straight is not None and mirrored is not None
+    back = flipped_back(mirrored, board, picture.shape[1])
+    np.testing.assert_array_equal(back.ids, straight.ids)
+    assert np.abs(back.pixels - straight.pixels).max() < 0.5
 
 
 def test_boards_that_look_alike_after_half_a_turn_are_known_and_told() -> None:
