@@ -88,7 +88,9 @@ def measure(seed: int, outfit: str, motion: str, n_frames: int) -> list[float]:
 
 def main() -> None:
     """Print the table and the machine."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--frames", type=int, default=40, help="frames of one period (default 40)")
     args = parser.parse_args()
     print(machine())

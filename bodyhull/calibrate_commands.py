@@ -20,9 +20,10 @@ class CalibrateList:
 class Calibrate:
     """Calibration: a rig refined from the recording itself (refine)."""
 
-    action: Annotated[Refine, tyro.conf.subcommand("refine")] | Annotated[
-        CalibrateList, tyro.conf.subcommand("list")
-    ]
+    action: (
+        Annotated[Refine, tyro.conf.subcommand("refine")]
+        | Annotated[CalibrateList, tyro.conf.subcommand("list")]
+    )
 
 
 def perform_calibrate(command: Calibrate) -> int:
