@@ -49,7 +49,7 @@ def test_a_rig_is_refined_written_and_taken_as_a_calibration(off: Path, tmp_path
         before, after = float(row[3]), float(row[5])
         assert after < before / 3, row
         assert 0.3 < float(row[1]) < 1.6 and 3 < float(row[2]) < 60, row
-    assert "from outlines of 4 frames, judged on 1 others" in said.out
+    assert "from outlines of 4 frames, judged on 2 others" in said.out
     truth, _ = filmed(N_CAMERAS, N_FRAMES, SIDE_PX)
     opened = open_recording(off, calibration=out, units="m", up="z")
     assert pixels_apart(opened.rig, truth).max() < 0.5

@@ -32,8 +32,6 @@ COMMANDS = {
     "rig-study": "--out --layout --calibration --size --units --up --cameras --widths --calibration-px "
     "--mask-px --base-cameras --base-width --frames --motion --garment --seed --body --hull-only "
     "--jobs --overwrite",
-    "calibrate refine": "RECORDING --out --keypoints --focal --sequence --calibration --frames --units --up "
-    "--background",
     "doctor": "",
     "demo": "--out --seed --motion --garment",
 }
