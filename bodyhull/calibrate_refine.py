@@ -28,12 +28,12 @@ _N_SILHOUETTES, _FEWEST_FRAMES, _MOST_FRAMES, _MOST_KEYPOINT_FRAMES = 400, 8, 24
 # Time is cut into so many parts, of which some are held out: frames next to each other are nearly the same.
 _PARTS, _HELD_OUT_PARTS = 8, (2, 6)
 # The hulls of the others are carved in so many held-out frames, in fewer for large rigs, and no finer.
-_MOST_CARVED, _CARVED_CAMERAS, _VOXEL_M = 3, 48, 0.012
+_MOST_CARVED, _MOST_HULLS, _VOXEL_M = 3, 72, 0.016
 
 
 @dataclass(frozen=True)
 class Refine:
-    """Refine where the cameras stand from what the recording shows: the person's outlines, and keypoints where
+    """Refine where the cameras stand from what the recording shows: the person's outlines, and keypoints if
     there are any. No board is needed."""
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
@@ -159,7 +159,7 @@ def look(recording: Recording, keypoints: Path | None) -> Looked:
     outlines: tuple[list[OutlineFrame], list[OutlineFrame]] = ([], [])
     people: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     carved = []
-    n_carved = _MOST_CARVED if n_cameras <= _CARVED_CAMERAS // _MOST_CARVED + 8 else 1
+    n_carved = int(np.clip(_MOST_HULLS // n_cameras, 1, _MOST_CARVED))
     total = [spread(side, share) for side, share in zip(sides, shares, strict=True)]
     to_carve = set(spread(total[1], n_carved))
     progress = tqdm(total=sum(map(len, total)), desc="silhouettes", unit="frame", file=sys.stderr)
@@ -198,9 +198,7 @@ def scores(recording: Recording, refinement: Refinement, looked: Looked) -> tupl
     result = []
     for pose in (RigPose.of(recording.rig), refinement.pose):
         rig = pose.in_rig(recording.rig)
-        each = [
-            agreement_with_others(rig, images, refinement.moved, _VOXEL_M) for _, images in looked.carved
-        ]
+        each = [agreement_with_others(rig, images, refinement.moved, _VOXEL_M) for _, images in looked.carved]
         iou = _mean_known(np.array(each).reshape(-1, len(rig)))
         result.append(score_pose(recording.rig, pose, looked.held_out, refinement.moved, iou))
     return result[0], result[1]
@@ -230,12 +228,14 @@ def table(rig: Rig, refinement: Refinement, before: RigScore, after: RigScore) -
         row = [name, f"{turned[k]:.3f}", f"{shifted[k]:.1f}"]
         row += [f"{100 * np.expm1(step[k, N_POSE]):+.2f}"] if with_focal else []
         row += [_change(before.keypoint_px[k], after.keypoint_px[k], 2)] if with_keypoints else []
-        row += [_change(before.outline_px[k], after.outline_px[k], 2), _change(before.iou[k], after.iou[k], 3)]
+        row += [
+            _change(before.outline_px[k], after.outline_px[k], 2),
+            _change(before.iou[k], after.iou[k], 3),
+        ]
         rows.append(row)
     widths = [max(len(row[i]) for row in rows) for i in range(len(header))]
     return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
     )
 
 

@@ -85,24 +85,25 @@ class KeypointTerm:
         length = np.linalg.norm(residuals, axis=1)
         noise = max(float(np.median(length)) / _RAYLEIGH_MEDIAN, _LEAST_NOISE_PX)
         weight = fading(length, scale_px) / noise**2
-        matrix = np.zeros((n_cameras, n_unknowns, n_cameras, n_unknowns))
+        own = np.zeros((n_cameras, n_unknowns, n_cameras, n_unknowns))
         right = np.zeros((n_cameras, n_unknowns))
         weighted = weight[:, None, None] * by_camera
-        diagonal = np.einsum("rai,raj->rij", by_camera, weighted)
+        squares = np.einsum("rai,raj->rij", by_camera, weighted)
         for camera_idx in range(n_cameras):
-            own = seen.camera == camera_idx
-            matrix[camera_idx, :, camera_idx] = diagonal[own].sum(axis=0)
-            right[camera_idx] = -np.einsum("rai,ra->i", weighted[own], residuals[own])
+            rows = seen.camera == camera_idx
+            own[camera_idx, :, camera_idx] = squares[rows].sum(axis=0)
+            right[camera_idx] = -np.einsum("rai,ra->i", weighted[rows], residuals[rows])
         of_point, pull = _point_equations(seen, residuals, by_point, weight)
         across = np.zeros((seen.n_points, n_cameras, n_unknowns, 3))
         # A camera sees a joint once: no two rows go to one place.
         across[seen.point, seen.camera] = np.einsum("rai,raj->rij", weighted, by_point)
-        across = across.reshape(seen.n_points, n_columns, 3)
-        eliminated = np.einsum("pui,pij->puj", across, np.linalg.inv(of_point))
-        flat = across.transpose(1, 0, 2).reshape(n_columns, -1)
-        matrix = matrix.reshape(n_columns, n_columns)
-        matrix = matrix - eliminated.transpose(1, 0, 2).reshape(n_columns, -1) @ flat.T
-        return Equations(matrix, right.ravel() - np.einsum("pui,pi->u", eliminated, pull))
+        flat = across.reshape(seen.n_points, n_columns, 3)
+        eliminated = np.einsum("pui,pij->puj", flat, np.linalg.inv(of_point))
+        through = np.tensordot(eliminated, flat, axes=([0, 2], [0, 2]))
+        return Equations(
+            own.reshape(n_columns, n_columns) - through,
+            right.ravel() - np.einsum("pui,pi->u", eliminated, pull),
+        )
 
     def _points(self, pose: RigPose) -> Float[np.ndarray, "p 3"]:
         """The joints (P 3), world: where their rays meet, then robustly by reprojection."""

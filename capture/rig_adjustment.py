@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -94,6 +94,7 @@ class Equations:
     right: Float[np.ndarray, " u"]
 
 
+@runtime_checkable
 class Term(Protocol):
     """A source of contradictions between cameras."""
 

@@ -49,10 +49,10 @@ def outline_of(mask: UInt8[np.ndarray, "h w"]) -> Outline | None:
     x_1, y_1 = (facts[kept][:, :2] + facts[kept][:, 2:4]).max(axis=0)
     part = np.isin(pieces[y_0:y_1, x_0:x_1], kept).astype(np.float32)
     margin = int(np.ceil(4 * _SMOOTH_PX)) + 1
-    part = cv2.copyMakeBorder(part, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=0.0)
-    part = cv2.GaussianBlur(part, (0, 0), _SMOOTH_PX)
+    framed = cv2.copyMakeBorder(part, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=0.0)
+    smooth = cv2.GaussianBlur(framed, (0, 0), _SMOOTH_PX)
     loops = []
-    for contour in find_contours(part, 0.5):
+    for contour in find_contours(smooth, 0.5):
         loop = _evenly_spaced(contour[:, ::-1] + [x_0 - margin, y_0 - margin])
         if loop is not None:
             loops.append(loop)

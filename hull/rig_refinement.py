@@ -1,8 +1,8 @@
 """A rig refined from what a recording holds: silhouettes, and keypoints where there are any.
 
-Coarse to fine: the outermost touching planes of all pairs of cameras (and the keypoints) bring a rig that is a
-degree off to a few tenths of a pixel's width of itself; then planes that touch anywhere are paired, several
-times, as the pairing gets surer. A camera that keeps contradicting the others (it shows another moment, or it
+Coarse to fine: the outermost touching planes of all pairs of cameras (and the keypoints) bring a rig that is
+a degree off to within about a pixel; then planes that touch anywhere are paired, several times, as the
+pairing gets surer. A camera that keeps contradicting the others (it shows another moment, or it
 is not the camera that it is said to be) is left as it was and told, and does not move the others.
 """
 
@@ -21,17 +21,18 @@ from hull.errors import HullError
 from hull.tangency import InnerTangency, OuterTangency
 from hull.touching_planes import OutlineFrame
 
-# A camera contradicts the others if its median residual is so many times the usual one, and so large (outlines,
-# keypoints)...
+# A camera contradicts the others if its median residual is so many times the usual one, and so large
+# (outlines, keypoints)...
 _FACTOR, _LEAST_PX = 4.0, (3.0, 12.0)
-# ... or smaller, while its large residuals (a fifth of them) stand out too: one that shows another moment is
-# turned until the trunk fits, and the limbs do not; one whose outlines are merely ragged has no such residuals.
+# ... or smaller, while its large residuals (a fifth of them) stand out too: one that shows another moment
+# is turned until the trunk fits, and the limbs do not; outlines that are merely ragged leave no such
+# residuals.
 _LARGE_FACTOR, _LARGE_PX, _SMALLER = 6.0, (4.0, 30.0), 0.27
 _LARGE_PERCENTILE = 80
 # At most this share of the cameras may, else nobody can tell who is right.
 _MOST_OUT = 1 / 3
 _FEWEST = 3
-# Planes are paired when they are nearer than so many times the noise, within these pixels; so many times over.
+# Planes are paired when nearer than so many times the noise, within these pixels; so many times over.
 _REACH, _LEAST_REACH_PX, _MOST_REACH_PX, _ROUNDS = 4.0, 2.0, 6.0, 4
 _FINE = AdjustmentSettings(least_scale_px=0.5)
 # Numbers that a rig is judged by may not get worse by more than this.
@@ -114,9 +115,7 @@ def refine_pose(rig: Rig, evidence: Evidence, *, focal: bool = False) -> Refinem
             f"{int(seen.sum())} of {len(rig)} cameras show anybody in the frames chosen ({names}); refining "
             f"needs {n_needed}: choose other frames with --frames, or mend the silhouettes"
         )
-    left = {
-        int(k): "shows nobody in the frames chosen; left as it was" for k in np.flatnonzero(~seen)
-    }
+    left = {int(k): "shows nobody in the frames chosen; left as it was" for k in np.flatnonzero(~seen)}
     use = seen.copy()
     pose, badness = _coarse(given, evidence, use, focal)
     while badness.max() > 1:
@@ -135,8 +134,8 @@ def refine_pose(rig: Rig, evidence: Evidence, *, focal: bool = False) -> Refinem
             continue
         large = [_by_camera(term, tried, len(rig))[1][camera_idx] for term in _terms(evidence, back)]
         left[camera_idx] = (
-            f"contradicts the others by {np.nanmax(large):.0f} px and more, wherever it is turned; left as it "
-            "was. Does it show the same moment, and is it the camera that it is said to be?"
+            f"contradicts the others by {np.nanmax(large):.0f} px and more, wherever it is turned; left as "
+            "it was. Does it show the same moment, and is it the camera that it is said to be?"
         )
     pose = _fine(given, evidence, use, focal, pose)
     pose = _with(pose, given, ~use)
@@ -152,9 +151,7 @@ def score_pose(
     keypoints = KeypointTerm(Detections.of_frames(evidence.people).of_cameras(use)).residuals(pose)
     by_camera, over_all = [], []
     for residuals, cameras in (outlines, keypoints):
-        by_camera.append(
-            np.array([_median(residuals[(cameras == k).any(axis=1)]) for k in range(len(rig))])
-        )
+        by_camera.append(np.array([_median(residuals[(cameras == k).any(axis=1)]) for k in range(len(rig))]))
         over_all.append(_median(residuals))
     return RigScore(by_camera[0], by_camera[1], iou, over_all[0], over_all[1])
 
@@ -215,10 +212,7 @@ def _by_camera(
     residuals, cameras = term.residuals(pose)
     each = [np.abs(residuals[(cameras == k).any(axis=1)]) for k in range(n_cameras)]
     usual, large = np.array(
-        [
-            np.percentile(mine, (50, _LARGE_PERCENTILE)) if mine.size else (np.nan, np.nan)
-            for mine in each
-        ]
+        [np.percentile(mine, (50, _LARGE_PERCENTILE)) if mine.size else (np.nan, np.nan) for mine in each]
     ).T
     return usual, large
 

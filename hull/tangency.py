@@ -58,9 +58,7 @@ class InnerTangency:
         return _equations(pose, self.touches, scale_px, n_unknowns)
 
 
-def _residuals(
-    pose: RigPose, touches: Touches
-) -> tuple[Float[np.ndarray, " r"], Int[np.ndarray, "r 2"]]:
+def _residuals(pose: RigPose, touches: Touches) -> tuple[Float[np.ndarray, " r"], Int[np.ndarray, "r 2"]]:
     return linearised(pose, touches, 0)[0], touches.cameras
 
 
@@ -86,7 +84,8 @@ def linearised(
     first, second = touches.cameras.T
     # Rows times these are rays in the world.
     turn = (pose.rotations[first], pose.rotations[second])
-    rays = [np.einsum("rij,ri->rj", turn[side], touches.rays[:, side]) for side in (0, 1)]
+    in_camera = touches.rays(pose)
+    rays = [np.einsum("rij,ri->rj", turn[side], in_camera[:, side]) for side in (0, 1)]
     baseline = pose.centres[second] - pose.centres[first]
     # The volume spanned by the two rays and the baseline, d0 . (b x d1), is nought where a plane holds all.
     by_ray = (np.cross(baseline, rays[1]), np.cross(rays[0], baseline))
@@ -106,7 +105,7 @@ def linearised(
             rows[:, side, 3:N_POSE] = sign * by_centre
             if n_unknowns > N_POSE:
                 # A longer lens narrows the ray towards the axis.
-                narrowed = touches.rays[:, side] * [-1.0, -1.0, 0.0]
+                narrowed = in_camera[:, side] * [-1.0, -1.0, 0.0]
                 rows[:, side, N_POSE] = (by_ray[side] * np.einsum("rij,ri->rj", turn[side], narrowed)).sum(
                     axis=1
                 )

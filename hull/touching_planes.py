@@ -23,8 +23,8 @@ from capture.rig_adjustment import RigPose
 from hull.outlines import Outline, outline_of
 from hull.tables import BACKGROUND
 
-# A silhouette must lie so far from the line between the centres (cosine of the angle around it): a camera that
-# looks along that line sees the person all around it, and no plane touches.
+# A silhouette must lie so far from the line between the centres (cosine of the angle around it): a camera
+# that looks along that line sees the person all around it, and no plane touches.
 _LEAST_AHEAD = 0.35
 # An outline bulges where the slope is the largest within this share of the person's size, by so many pixels.
 _BULGE_SHARE, _BULGE_PX = 1 / 85, 0.5
@@ -37,19 +37,29 @@ class Touches:
     """Planes that touch, one a row.
 
     cameras : (R 2) whose silhouettes.
-    rays : (R 2 3) to where they touch, camera axes, z = 1.
+    pixels : (R 2 2) where they touch.
     """
 
     cameras: Int[np.ndarray, "r 2"]
-    rays: Float[np.ndarray, "r 2 3"]
+    pixels: Float[np.ndarray, "r 2 2"]
 
     @staticmethod
     def joined(parts: Sequence[Touches]) -> Touches:
         """All of them."""
         return Touches(
             np.concatenate([part.cameras for part in parts] or [np.zeros((0, 2), int)]),
-            np.concatenate([part.rays for part in parts] or [np.zeros((0, 2, 3))]),
+            np.concatenate([part.pixels for part in parts] or [np.zeros((0, 2, 2))]),
         )
+
+    def rays(self, pose: RigPose) -> Float[np.ndarray, "r 2 3"]:
+        """(R 2 3) to where they touch, camera axes, z = 1."""
+        homogeneous = np.concatenate([self.pixels, np.ones((*self.pixels.shape[:2], 1))], axis=2)
+        return np.einsum("rsij,rsj->rsi", np.linalg.inv(pose.intrinsics)[self.cameras], homogeneous)
+
+    @staticmethod
+    def of_rays(pose: RigPose, cameras: Int[np.ndarray, "r 2"], rays: Float[np.ndarray, "r 2 3"]) -> Touches:
+        """Inverse of `rays`."""
+        return Touches(cameras, np.einsum("rsij,rsj->rsi", pose.intrinsics[cameras][:, :, :2], rays))
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +139,9 @@ def outer_touches(frame: OutlineFrame, pose: RigPose, use: Bool[np.ndarray, " c"
         for k, index in enumerate((slope.argmin(axis=1), slope.argmax(axis=1))):
             usable[k, which] &= ahead & sure[index]
             found[k, which, side] = in_camera[index]
-    return Touches.joined([Touches(pairs.cameras[usable[k]], found[k][usable[k]]) for k in (0, 1)])
+    return Touches.joined(
+        [Touches.of_rays(pose, pairs.cameras[usable[k]], found[k][usable[k]]) for k in (0, 1)]
+    )
 
 
 def inner_touches(
@@ -155,15 +167,15 @@ def inner_touches(
         mutual &= apart[np.arange(len(slope)), nearest] < reach_px
         found.append(np.stack([ray[mutual], other_ray[nearest[mutual]]], axis=1))
         cameras.append(np.repeat(pairs.cameras[pair_idx][None], mutual.sum(), axis=0))
-    touches = Touches.joined([Touches(c, r) for c, r in zip(cameras, found, strict=True)])
+    touches = Touches.joined([Touches.of_rays(pose, c, r) for c, r in zip(cameras, found, strict=True)])
     seen = _seen_by_all(touches, frame, pose, use)
-    return Touches(touches.cameras[seen], touches.rays[seen])
+    return Touches(touches.cameras[seen], touches.pixels[seen])
 
 
 def _rays(
     frame: OutlineFrame, pose: RigPose, use: Bool[np.ndarray, " c"], corners_only: bool
 ) -> dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """For each camera with an outline: rays in its own axes (N 3), in the world's (N 3), and which are sure."""
+    """For each camera with an outline: rays in its own axes (N 3), in the world's (N 3), and whether sure."""
     result = {}
     for camera_idx, outline in enumerate(frame.outlines):
         if outline is None or not use[camera_idx]:
@@ -176,9 +188,7 @@ def _rays(
     return result
 
 
-def _on_plane(
-    pose: RigPose, camera_idx: int, pixels: Float[np.ndarray, "n 2"]
-) -> Float[np.ndarray, "n 3"]:
+def _on_plane(pose: RigPose, camera_idx: int, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
     homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
     return np.linalg.solve(pose.intrinsics[camera_idx], homogeneous.T).T
 
@@ -252,9 +262,9 @@ def _bulges(
                 top &= height - np.roll(height, shift, axis=1) > least
             row, at = np.nonzero(top & sure)
             pair = which[row]
-            behind = (within[at] * pairs.sideways[pair]).sum(axis=1) / (
-                within[at] * pairs.forward[pair]
-            ).sum(axis=1)
+            behind = (within[at] * pairs.sideways[pair]).sum(axis=1) / (within[at] * pairs.forward[pair]).sum(
+                axis=1
+            )
             outwards = (behind < slope[row, at]) == upwards
             row, at, pair = row[outwards], at[outwards], pair[outwards]
             for each in np.unique(pair):
@@ -273,8 +283,9 @@ def _seen_by_all(
     """Which touching rays (R,) meet in front of both cameras where no camera in use sees background."""
     first, second = touches.cameras.T
     unit = []
+    rays = touches.rays(pose)
     for side, cameras in ((0, first), (1, second)):
-        ray = np.einsum("rij,ri->rj", pose.rotations[cameras], touches.rays[:, side])
+        ray = np.einsum("rij,ri->rj", pose.rotations[cameras], rays[:, side])
         unit.append(ray / np.linalg.norm(ray, axis=1, keepdims=True))
     baseline = pose.centres[second] - pose.centres[first]
     cosine = (unit[0] * unit[1]).sum(axis=1)
@@ -282,10 +293,7 @@ def _seen_by_all(
     along, beyond = (baseline * unit[0]).sum(axis=1), (baseline * unit[1]).sum(axis=1)
     depth = ((along - cosine * beyond) / scale, (cosine * along - beyond) / scale)
     points = 0.5 * (
-        pose.centres[first]
-        + depth[0][:, None] * unit[0]
-        + pose.centres[second]
-        + depth[1][:, None] * unit[1]
+        pose.centres[first] + depth[0][:, None] * unit[0] + pose.centres[second] + depth[1][:, None] * unit[1]
     )
     seen = (depth[0] > 0) & (depth[1] > 0)
     for camera_idx, possible in enumerate(frame.possible):

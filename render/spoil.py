@@ -29,6 +29,22 @@ def misplaced_rig(rig: Rig, sigma_px: float, seed: int) -> Rig:
     return Rig(tuple(_turned(camera, sigma_px * rng.standard_normal(3)) for camera in rig))
 
 
+def displaced_rig(rig: Rig, turn_deg: tuple[float, float], shift_m: tuple[float, float], seed: int) -> Rig:
+    """The rig as a calibration would give it that is not its own any more (pinholes): each camera turned
+    about its centre and its centre shifted, in random directions, by angles and ways drawn evenly from two
+    ranges."""
+    rng = np.random.default_rng([seed, 12])
+    cameras = []
+    for camera in rig:
+        axis, way = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
+        pose = np.eye(4)
+        turn = cv2.Rodrigues(np.radians(rng.uniform(*turn_deg)) * axis)[0]
+        pose[:3, :3] = turn @ camera.camera_from_world[:3, :3]
+        pose[:3, 3] = -pose[:3, :3] @ (camera.centre + rng.uniform(*shift_m) * way)
+        cameras.append(replace(camera, camera_from_world=pose, projection=None))
+    return Rig(tuple(cameras))
+
+
 def _turned(camera: Camera, error_px: Float[np.ndarray, " 3"]) -> Camera:
     focal_x, focal_y = camera.intrinsics[0, 0], camera.intrinsics[1, 1]
     about = np.array([-error_px[1] / focal_y, error_px[0] / focal_x, error_px[2] / (0.5 * min(camera.size))])
