@@ -4,8 +4,8 @@ Colour differences (Cb, Cr) are divided by brightness, so that folds and shadows
 screen. Along the direction from grey to the key colour, the screen lies near one, the person near nought or
 below, and the person's own parts that the screen lights up (spill, reflections on legs and shiny shoes) in
 between; what lies beside that direction is another colour. Below the low threshold is the person, above the
-high one the screen; what is between goes with the side that it borders on. Where an empty picture shows no
-screen (the studio beyond its edge), the difference to that picture decides.
+high one the screen; what is between goes with the side that it has more of around it. Where an empty picture
+shows no screen (the studio beyond its edge), the difference to that picture decides.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from capture.plate_difference import PlateDifference, PlateLook
 
 _LOW, _HIGH = 0.45, 0.7  # of the key's strength
 _ASIDE = 0.8  # what a unit beside the key's direction takes away
-_SPILL_RIM = 0.5  # grey pixels are the person's where so much of their rim is
+_NEAR_SHARE = 200  # of the longer side: the radius in which a doubtful pixel looks for its side
+_STEEP = 3.0  # a level of colour in the tests' bytes
 _LEAST_STRENGTH = 0.12  # of a key colour: colour difference over brightness
 _SCREEN_SHARE = 0.25  # of a picture, that makes it one before a screen
 _DARK = 24.0  # levels of brightness below which colours mean little
@@ -48,6 +49,8 @@ class KeyDifference:
         small = coarse_of(empty.plate, step)
         screen = np.where(_keyness(small, key) > _HIGH, 255, 0).astype(np.uint8)
         screen = cv2.morphologyEx(screen, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)).astype(np.uint8)
+        if screen.all():
+            return KeyDifference(key, step)
         return KeyDifference(key, step, empty, screen)
 
     def look(self, picture: Picture) -> KeyLook:
@@ -77,6 +80,8 @@ class KeyLook:
         if self.other is None or self.model.screen is None:
             return person
         screen = full_size(self.model.screen, self.model.step, box)
+        if screen.all():
+            return person
         return np.where(screen > 0, person, self.other.fine(box)).astype(np.uint8)
 
 
@@ -117,27 +122,39 @@ def _chroma(picture: Picture) -> tuple[Float[np.ndarray, "_h _w"], Float[np.ndar
 def _keyness(picture: Picture, key: Float[np.ndarray, "2"]) -> Float[np.ndarray, "_h _w"]:
     """How much of the key each pixel holds: 1 on the screen, 0 and less on other colours."""
     _, chroma = _chroma(picture)
+    along, aside = _directions(key)
+    return chroma @ along.astype(np.float32) - np.float32(_ASIDE) * np.abs(chroma @ aside.astype(np.float32))
+
+
+def _directions(key: Float[np.ndarray, "2"]) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     strength = float(np.linalg.norm(key))
-    along = (key / strength**2).astype(np.float32)
-    aside = (np.array([-key[1], key[0]]) / strength**2).astype(np.float32)
-    # The screen may be lit unevenly: more of the key than the key is still the key.
-    return np.minimum(chroma @ along, 1.2) - np.float32(_ASIDE) * np.abs(chroma @ aside)
+    return key / strength**2, np.array([-key[1], key[0]]) / strength**2
+
+
+def _tests(key: Float[np.ndarray, "2"]) -> Float[np.ndarray, "4 4"]:
+    """Four linear functions of a picture's RGB (and 1), in bytes with 128 for nought.
+
+    "Keyness below t" is min(along + aside, along - aside) < t times brightness, linear in the levels: the
+    first two functions are at least 128 on what passes the low threshold, the others the high one.
+    """
+    grey = np.array([0.299, 0.587, 0.114, 0.0])
+    blue = 0.564 * (np.array([0.0, 0.0, 1.0, 0.0]) - grey)
+    red = 0.713 * (np.array([1.0, 0.0, 0.0, 0.0]) - grey)
+    along, aside = (part[0] * blue + part[1] * red for part in _directions(key))
+    lit = grey + np.array([0.0, 0.0, 0.0, _DARK / 4])
+    rows = [along + side * _ASIDE * aside - t * lit for t in (_LOW, _HIGH) for side in (1, -1)]
+    return _STEEP * np.array(rows) + np.array([0.0, 0.0, 0.0, 128.0])
 
 
 def _person(picture: Picture, key: Float[np.ndarray, "2"]) -> Mask:
-    keyness = _keyness(picture, key)
-    person = np.where(keyness < _LOW, 255, 0).astype(np.uint8)
-    doubtful = np.where((keyness >= _LOW) & (keyness < _HIGH), 255, 0).astype(np.uint8)
-    if not doubtful.any() or not person.any():
-        return person
-    n_parts, labels = cv2.connectedComponents(doubtful)
-    # Each doubtful part's rim, counted at once: every pixel of it tells its part whether it is the person's.
-    grown = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8))
-    rim = (grown > 0) & (labels == 0)
-    of = grown[rim].astype(np.int64)
-    n_rim = np.bincount(of, minlength=n_parts)
-    n_person = np.bincount(of, weights=person[rim] > 0, minlength=n_parts)
-    kept = n_person > _SPILL_RIM * np.maximum(n_rim, 1)
-    kept[0] = False
-    person[kept[labels]] = 255
-    return person
+    passed = cv2.transform(picture, _tests(key))
+    top = np.full(4, 255.0)
+    sure = cv2.inRange(passed, np.array([0.0, 0.0, 128.0, 128.0]), top)  # the screen
+    maybe = cv2.inRange(passed, np.array([128.0, 128.0, 0.0, 0.0]), top)
+    person = cv2.bitwise_not(maybe)
+    doubtful = cv2.subtract(maybe, sure)
+    if cv2.countNonZero(doubtful):
+        side = 2 * max(2, round(max(picture.shape) / _NEAR_SHARE)) + 1
+        around = cv2.compare(cv2.blur(person, (side, side)), cv2.blur(sure, (side, side)), cv2.CMP_GE)
+        person = cv2.bitwise_or(person, cv2.bitwise_and(doubtful, around))
+    return person.astype(np.uint8, copy=False)

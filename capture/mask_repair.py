@@ -201,8 +201,10 @@ class MaskRepair:
         voxels = dissent <= allowed
         support = self._seen_as(hull.box, voxels, camera_idx, 1.5 * self.reach[camera_idx])
         surplus = (mask & ~support).astype(np.uint8)
-        surplus = cv2.morphologyEx(surplus, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-        return _large_parts(surplus) & mask
+        solid = cv2.morphologyEx(surplus, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)).astype(np.uint8)
+        parts = _large_parts(solid).astype(np.uint8)
+        # With the rim that the opening took off.
+        return (cv2.dilate(parts, np.ones((3, 3), np.uint8)) > 0) & (surplus > 0)
 
     def _missing(
         self,

@@ -344,7 +344,7 @@ def _without_shadow(outline: Bool[np.ndarray, "_h _w"], look: Look, step: int) -
 
 
 def _is_empty(mask: Mask | None) -> bool:
-    return mask is None or cv2.minMaxLoc(mask)[1] < 255
+    return mask is None or cv2.countNonZero(mask) == 0
 
 
 def _light_phrase(changed: float) -> str:

@@ -126,8 +126,13 @@ class _Parts:
 
 def largest_parts(mask: Mask) -> Mask:
     """Without cameras to ask: the largest thing in view, and others of a tenth of it."""
-    parts = _Parts.of(mask)
-    return parts.mask((parts.areas > 0) & (parts.areas >= 0.1 * parts.areas.max()))
+    x, y, width, height = cv2.boundingRect(mask)
+    result = np.zeros_like(mask)
+    if width:
+        box = (slice(y, y + height), slice(x, x + width))
+        parts = _Parts.of(mask[box])
+        result[box] = parts.mask((parts.areas > 0) & (parts.areas >= 0.1 * parts.areas.max()))
+    return result
 
 
 def _scaled(finder: RegionFinder, coarse: Sequence[Mask | None]) -> list[Mask | None]:
