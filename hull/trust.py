@@ -70,8 +70,9 @@ def _votes(surplus: float, n_members: int) -> tuple[int, ...]:
 
 
 def quick_agreement(moments: Sequence[Moment], asked: Sequence[int]) -> float:
-    """0 to 1: how well all these cameras fit what all but two of them agree on, however many are wrong."""
-    votes = min(3, max(len(asked) - 2, 1))
+    """0 to 1: how well all these cameras fit what all but one or two of them agree on, however many are
+    wrong."""
+    votes = 1 if len(asked) < 4 else 2 if len(asked) <= 8 else 3
     fits = [
         fit
         for moment in moments[:: max(len(moments) // 2, 1)]
