@@ -25,7 +25,7 @@ def late_cameras(
     named: set[int],
     asked: Sequence[int],
 ) -> list[Finding]:
-    """Cameras that show another moment than the others, unless something else is wrong with them (`named`)."""
+    """Cameras that show another moment than the others, if nothing else is wrong with them (`named`)."""
     found = []
     step = facts.usual_step
     for i in asked:

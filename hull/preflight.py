@@ -20,11 +20,21 @@ from hull.moments_verdict import frozen_cameras, late_cameras, silent_cameras
 from hull.reference import NO_FIT, Fit, Moment, moment_of, normalising_scale
 from hull.repairs import Repair, best_for_rig, camera_repairs, fits_with_pictures_of, likely_for_rig, repaired
 from hull.time_offsets import MOST_FRAMES, TimeOffset, time_offsets
-from hull.trust import Trust, cut_by, fits_without_each, mean_fits, quick_agreement, trusted_cameras
+from hull.trust import (
+    EXPLAINED,
+    Trust,
+    cut_by,
+    fits_without_each,
+    mean_fits,
+    quick_agreement,
+    trusted_cameras,
+)
 
 _N_MOMENTS, _N_MOMENTS_LARGE, _LARGE_RIG = 6, 4, 24
 # A rig is looked at as a whole where less than this is explained.
 _WELL_EXPLAINED = 0.97
+# Nothing is wrong with the whole of a rig of which this share agrees.
+_MOST = 0.75
 # All cameras agree less than this (see `quick_agreement`) only where all of them are wrong.
 _HOPELESS = 0.4
 # A camera is looked at closely when this share of its silhouette sticks out of the hull of the others, and
@@ -98,7 +108,8 @@ def examine(facts: FrameFacts) -> Examination:
             better = best_for_rig(moments, asked, likely, _HOPELESS)
     if better is None:
         trust = trusted_cameras(moments, asked)
-        if can_judge and trust.score < _WELL_EXPLAINED:
+        most_agree = trust.surplus < EXPLAINED and len(trust.members) >= _MOST * len(asked)
+        if can_judge and trust.score < _WELL_EXPLAINED and not most_agree:
             likely = likely_for_rig(moments, asked, plain)
             better = best_for_rig(moments, asked, likely, trust.score)
     if better is not None:

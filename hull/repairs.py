@@ -267,7 +267,7 @@ def best_for_rig(
     best = None
     for _, repair in likely:
         made = rig_with(moments, repair)
-        trust = trusted_cameras(made, asked)
+        trust = trusted_cameras(made, asked, at_least=max(now, 0.0 if best is None else best[2].score))
         if best is None or trust.score > best[2].score:
             best = repair, made, trust
     if best is None or 1 - best[2].score > 0.6 * (1 - now) or best[2].score < now + 0.02:

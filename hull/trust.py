@@ -40,13 +40,19 @@ class Trust:
         return len(self.members) / max(self.n_asked, 1) * (1 - self.surplus)
 
 
-def trusted_cameras(moments: Sequence[Moment], asked: Sequence[int], fewest: int = 3) -> Trust:
-    """The cameras among `asked` that agree in these frames; at least half of them, and `fewest`, stay."""
+def trusted_cameras(
+    moments: Sequence[Moment], asked: Sequence[int], fewest: int = 3, at_least: float = 0.0
+) -> Trust:
+    """The cameras among `asked` that agree in these frames; at least half of them, and `fewest`, stay.
+
+    `at_least`: give up as soon as the score cannot be better than that.
+    """
     moments = moments[:: max(len(moments) // _N_MOMENTS, 1)]
     members = [i for i in asked if any(moment.views[i] is not None for moment in moments)]
     n_asked = len(members)
     surplus = _surplus(moments, members, 1)
-    while surplus > EXPLAINED and len(members) > max(n_asked // 2, fewest):
+    stop = max(n_asked // 2, fewest, int(at_least * n_asked))
+    while surplus > EXPLAINED and len(members) > stop:
         candidates = _refusing(moments, members)
         leaving, least = None, surplus
         for votes in _votes(surplus, len(members)):
@@ -70,8 +76,9 @@ def _votes(surplus: float, n_members: int) -> tuple[int, ...]:
 
 
 def quick_agreement(moments: Sequence[Moment], asked: Sequence[int]) -> float:
-    """0 to 1: how well all these cameras fit what all but two of them agree on, however many are wrong."""
-    votes = min(3, max(len(asked) - 2, 1))
+    """0 to 1: how well all these cameras fit what all but one or two of them agree on, however many are
+    wrong."""
+    votes = 1 if len(asked) < 4 else 2 if len(asked) <= 8 else 3
     fits = [
         fit
         for moment in moments[:: max(len(moments) // 2, 1)]

@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 
 from benchmarks.preflight import PLANTS, Scene, late_by, told_by, write_scene
 from bodyhull.checking import check_recording
-from capture.frame_facts import scaled_camera
+from capture.frame_facts import FrameFacts, scaled_camera
 from capture.layouts import dome_layout
 from capture.rig import Rig
 from capture.still_pictures import frozen_runs
@@ -171,14 +170,22 @@ def test_few_cameras_and_few_frames_raise_no_alarm(tmp_path: Path, n_cameras: in
 
 
 def test_a_run_of_equal_pictures_counts_only_while_others_move() -> None:
-    facts = SimpleNamespace(
-        changed=np.array([[np.nan, 0.1, 0.1, 0.0, 0.0, 0.0, 0.1], *[[np.nan, *[0.1] * 6]] * 3]),
-        border=np.zeros((4, 7), dtype=bool),
-        present=np.ones((4, 7), dtype=bool),
+    changed = np.array([[np.nan, 0.1, 0.1, 0.0, 0.0, 0.0, 0.1], *[[np.nan, *[0.1] * 6]] * 3])
+    nothing, everything = np.zeros((4, 7), dtype=bool), np.ones((4, 7), dtype=bool)
+    facts = FrameFacts(
+        tuple(range(7)),
+        Rig(filmed().rig.cameras[:4]),
+        (1,) * 4,
+        everything,
+        np.ones((4, 7)),
+        changed,
+        nothing,
+        (),
+        {},
     )
-    assert [(r.camera_idx, r.first, r.last) for r in frozen_runs(facts)] == [(0, 2, 5)]  # type: ignore[arg-type]
-    facts.changed[1:] = 0.0
-    assert frozen_runs(facts) == []  # type: ignore[arg-type]
+    assert [(run.camera_idx, run.first, run.last) for run in frozen_runs(facts)] == [(0, 2, 5)]
+    assert frozen_runs(replace(facts, changed=np.vstack([changed[:1], 0 * changed[1:]]))) == []
+    assert frozen_runs(replace(facts, border=everything)) == [], "the person may move where nobody sees it"
 
 
 def test_a_camera_for_smaller_pictures_sees_the_same() -> None:
