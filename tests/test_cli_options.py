@@ -32,6 +32,16 @@ COMMANDS = {
     "rig-study": "--out --layout --calibration --size --units --up --cameras --widths --calibration-px "
     "--mask-px --base-cameras --base-width --frames --motion --garment --seed --body --hull-only "
     "--jobs --overwrite",
+    "convert": "IN OUT --to --units --size --undistorted --invert-poses --overwrite",
+    "calibrate boards": "IN --out --squares --square-mm --board --marker-mm --dictionary --floor --lenses "
+    "--intrinsics-only --wide --every",
+    "calibrate refine": "RECORDING --out --keypoints --focal --sequence --calibration --frames --units --up "
+    "--background",
+    "calibrate world": "RECORDING --out --floor --height-m --keypoints --sequence --calibration --frames "
+    "--units --up --background",
+    "silhouettes": "RECORDING --out --method --background --key --refine --no-repair --as-filmed --pictures "
+    "--calibration --sequence --frames --units --jobs --overwrite",
+    "check": "RECORDING --out --sample --calibration --sequence --frames --units --up --background",
     "doctor": "",
     "demo": "--out --seed --motion --garment",
 }
