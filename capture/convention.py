@@ -45,7 +45,7 @@ _FACTORS = (1.0, 1 / 2, 1 / 4, 2.0, 4.0, 1 / 3, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 3.0)
 # Symmetric about what is kept without evidence: noise flattens the peak and draws it to their middle.
 _OFFSETS_PX = (-1.0, -0.5, 0.0, 0.5, 1.0)
 _CLIP_PX = (-3.0, 2.0)
-_NEAR_PX, _MOST_ERROR_PX = 0.2, 0.08
+_NEAR_PX, _MOST_ERROR_PX = 0.2, 0.1
 _ENOUGH = 10  # cameras times frames from which half a pixel should be told
 _AXES: dict[str, tuple[tuple[int, int], tuple[int, int]]] = {
     # (u, v) of ours from (u, v) of the file: signs, or a swap; negative counts from the far side.

@@ -24,7 +24,7 @@ Masks = Sequence[UInt8[np.ndarray, "_h _w"] | None]
 
 _COARSE_PX = 160  # longer side of the pictures that gross errors are looked for in
 _N_PIXELS, _N_DEPTHS, _N_ROUGH = 48, 48, 72
-_N_OUTLINE = 32
+_N_OUTLINE, _N_FINE = 32, 13
 _FAR_PX = 1e4
 _MARGIN_PX = 16  # about a silhouette's box at full size; farther away than this is simply outside
 
@@ -80,25 +80,26 @@ def covered_shares(
 def outline_depths(
     rigs: Sequence[Rig], evidence: Evidence, subject: Float[np.ndarray, " 3"], reach: float
 ) -> list[list[Float[np.ndarray, "_k"]]]:
-    """For each rig (slight variants of the first) and camera in `evidence.seen`: how deep (px) the best point
-    on each outline ray lies inside the others' silhouettes, negative where none lies inside all."""
+    """For each rig (slight variants of the middle one) and camera in `evidence.seen`: how deep (px) the best
+    point on each outline ray lies inside the others' silhouettes, negative where none lies inside all."""
     rough = np.linspace(-reach, reach, _N_ROUGH)
+    usual = rigs[len(rigs) // 2]
     results: list[list[np.ndarray]] = [[] for _ in rigs]
     for k, camera_idx in enumerate(evidence.seen):
-        origin, directions = _rays(rigs[0], camera_idx, evidence.samples[k])
+        origin, directions = _rays(usual, camera_idx, evidence.samples[k])
         middle = (subject - origin) @ directions.T
         points = origin + directions[:, None] * (middle[:, None] + rough)[..., None]
-        best = middle + rough[_least_inside(rigs[0], evidence, points, k).argmax(axis=1)]
+        best = middle + rough[_least_inside(usual, evidence, points, k).argmax(axis=1)]
         for rig, found in zip(rigs, results, strict=True):
             origin_now, directions_now = _rays(rig, camera_idx, evidence.samples[k])
             at, step = best, rough[1] - rough[0]
             deepest = np.zeros(0)
             for _ in range(2):
-                tried = at[:, None] + step * np.linspace(-1, 1, 17)
+                tried = at[:, None] + step * np.linspace(-1, 1, _N_FINE)
                 points = origin_now + directions_now[:, None] * tried[..., None]
                 inside = _least_inside(rig, evidence, points, k)
                 at = np.take_along_axis(tried, inside.argmax(axis=1)[:, None], axis=1)[:, 0]
-                deepest, step = inside.max(axis=1), step / 8
+                deepest, step = inside.max(axis=1), 2 * step / (_N_FINE - 1)
             found.append(deepest)
     return results
 
