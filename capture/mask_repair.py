@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from capture.camera import Camera
 from capture.colour_difference import scaled_size
+from capture.plate_difference import light_gains, light_table, shaded
 from capture.rig import Rig
 from capture.silhouette_files import PERSON, UNKNOWN
 from capture.world import closest_point
@@ -233,7 +234,11 @@ class MaskRepair:
             return nothing, nothing
         size = self.sizes[camera_idx]
         now, then = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (picture, background))
-        faint = cv2.absdiff(now, then).max(axis=2) > _FAINT_LEVELS
+        table = light_table(light_gains(now, then))
+        even = now if table is None else cv2.LUT(now, table)
+        # A shadow differs too, and where one camera took it for the person, others may have.
+        shadow = shaded(even, then, np.maximum(cv2.cvtColor(then, cv2.COLOR_RGB2GRAY), 1)) > 0
+        faint = (cv2.absdiff(even, then).max(axis=2) > _FAINT_LEVELS) & ~shadow
         alike = _has_persons_colours(now, then, mask)
         labels, n_parts = scipy.ndimage.label(parts)
         given, unknown = nothing.copy(), nothing.copy()
