@@ -40,6 +40,7 @@ _FAINT_LEVELS = 10
 _SIGHTED_SHARE = 0.5
 _CAMOUFLAGE_SHARE = 0.6
 _COLOUR_STEP = 32
+_MOST_SURPLUS = 0.5  # of a mask
 _LEAST_AREA = 25  # px at that size
 
 Mask = UInt8[np.ndarray, "_h _w"]
@@ -111,7 +112,8 @@ class MaskRepair:
             surplus = self._surplus(hull, camera_idx, here)
             gone = 0
             result = mask
-            if surplus.any():
+            # Where most of a mask is denied, it is not clear that the others are right.
+            if surplus.any() and surplus.sum() < _MOST_SURPLUS * here.sum():
                 full = _enlarged(surplus, mask.shape) & (mask == PERSON)
                 gone = int(full.sum())
                 result = np.where(full, 0, result).astype(np.uint8)
