@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from capture.camera import Camera
 from capture.colour_difference import scaled_size
+from capture.plate_difference import light_gains, light_table, shaded
 from capture.rig import Rig
 from capture.silhouette_files import PERSON, UNKNOWN
 from capture.world import closest_point
@@ -39,6 +40,7 @@ _FAINT_LEVELS = 10
 _SIGHTED_SHARE = 0.5
 _CAMOUFLAGE_SHARE = 0.6
 _COLOUR_STEP = 32
+_MOST_SURPLUS = 0.5  # of a mask
 _LEAST_AREA = 25  # px at that size
 
 Mask = UInt8[np.ndarray, "_h _w"]
@@ -110,7 +112,8 @@ class MaskRepair:
             surplus = self._surplus(hull, camera_idx, here)
             gone = 0
             result = mask
-            if surplus.any():
+            # Where most of a mask is denied, it is not clear that the others are right.
+            if surplus.any() and surplus.sum() < _MOST_SURPLUS * here.sum():
                 full = _enlarged(surplus, mask.shape) & (mask == PERSON)
                 gone = int(full.sum())
                 result = np.where(full, 0, result).astype(np.uint8)
@@ -233,7 +236,11 @@ class MaskRepair:
             return nothing, nothing
         size = self.sizes[camera_idx]
         now, then = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (picture, background))
-        faint = cv2.absdiff(now, then).max(axis=2) > _FAINT_LEVELS
+        table = light_table(light_gains(now, then))
+        even = now if table is None else cv2.LUT(now, table)
+        # A shadow differs too, and where one camera took it for the person, others may have.
+        shadow = shaded(even, then, np.maximum(cv2.cvtColor(then, cv2.COLOR_RGB2GRAY), 1)) > 0
+        faint = (cv2.absdiff(even, then).max(axis=2) > _FAINT_LEVELS) & ~shadow
         alike = _has_persons_colours(now, then, mask)
         labels, n_parts = scipy.ndimage.label(parts)
         given, unknown = nothing.copy(), nothing.copy()

@@ -95,7 +95,7 @@ class PlateLook:
         x, y, width, height = cv2.boundingRect(differs)
         if model.shadows and width > 0:
             box = (slice(max(0, y - 2), y + height + 2), slice(max(0, x - 2), x + width + 2))
-            looks_so = cv2.bitwise_and(_shaded(even[box], plate[box], grey[box]), differs[box])
+            looks_so = cv2.bitwise_and(shaded(even[box], plate[box], grey[box]), differs[box])
             shadows = _true_shadows(differs[box], looks_so.astype(np.uint8))
             if cv2.countNonZero(shadows):
                 differs[box] = cv2.subtract(differs[box], shadows)
@@ -113,9 +113,9 @@ class PlateLook:
             x, y, width, height = cv2.boundingRect(near)
             if width:
                 part = (slice(y, y + height), slice(x, x + width))
-                shaded = _shaded(picture[part], model.plate[box][part], model.grey[box][part])
-                shaded = cv2.bitwise_and(shaded, near[part])
-                differs[part] = cv2.subtract(differs[part], shaded)
+                dimmed = shaded(picture[part], model.plate[box][part], model.grey[box][part])
+                dimmed = cv2.bitwise_and(dimmed, near[part])
+                differs[part] = cv2.subtract(differs[part], dimmed)
         return _at_half_height(differs.astype(np.uint8, copy=False), picture, model.plate[box])
 
 
@@ -157,7 +157,7 @@ def light_table(
     return np.clip(np.rint(table), 0, 255).astype(np.uint8)
 
 
-def _shaded(picture: Picture, plate: Picture, grey: UInt8[np.ndarray, "_h _w"]) -> UInt8[np.ndarray, "_h _w"]:
+def shaded(picture: Picture, plate: Picture, grey: UInt8[np.ndarray, "_h _w"]) -> UInt8[np.ndarray, "_h _w"]:
     """255 where the picture could be the plate, dimmed: darker, and of the plate's own colour."""
     ratio = cv2.divide(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.ascontiguousarray(grey), scale=_UNIT)
     dimmer = cv2.inRange(ratio, np.full(1, _SHADE_LOW * _UNIT), np.full(1, _SHADE_HIGH * _UNIT))
