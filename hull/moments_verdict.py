@@ -67,8 +67,9 @@ def frozen_cameras(
         if i in named:
             offset = offsets.get(i)
             n = 0 if offset is None or offset.frames is None else abs(round(offset.frames))
-            # A late camera whose first picture stands in for those that it has not got.
-            mine = [run for run in mine if not (_at_end(facts, run) and len(run) - 1 <= n)]
+            # A late camera whose first picture stands in for those that it has not got; the offset may be
+            # a frame off.
+            mine = [run for run in mine if not (_at_end(facts, run) and len(run) - 1 <= n + 1)]
         if not mine:
             continue
         n_repeats = sum(len(run) - 1 for run in mine)

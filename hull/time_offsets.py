@@ -24,6 +24,9 @@ _LEAST_GAIN, _AGREEING, _ERRORS = 0.003, 0.75, 3.0
 # The fit must fall by so much over two frames, or the person stands too still to tell.
 _LEAST_FALL = 0.004
 _MOST_ROUNDS = 5
+# A camera that is so many small pixels off its calibration fits another moment of a person who walks on;
+# what such a shift of its picture explains as well is not told.
+_SHIFT_PX = 3
 
 MaskOf = Callable[[int, int], "UInt8[np.ndarray, '_h _w'] | None"]
 """(camera, place of a frame) -> its mask, or None."""
@@ -75,8 +78,11 @@ def time_offsets(
 
     for _ in range(_MOST_ROUNDS):
         tables = {i: _table(current, members, i, view_of, most) for i in asked}
-        found = {i: _judged(table, most, shifts[i]) for i, table in tables.items()}
         gains = {i: _gain(tables[i], most, shifts[i]) for i in asked}
+        for i, (gain, shift) in gains.items():
+            if gain > 0 and not _is_time(current, members, i, view_of, shifts[i], shift):
+                gains[i] = 0.0, shifts[i]
+        found = {i: _judged(table, most, gains[i]) for i, table in tables.items()}
         best = max((gain for gain, _ in gains.values()), default=0.0)
         moved = {i: shift for i, (gain, shift) in gains.items() if gain > 0 and gain >= 0.5 * best}
         if not moved:
@@ -143,11 +149,39 @@ def _gain(table: Float[np.ndarray, "m s"], most: int, now: int) -> tuple[float, 
     return best, shift
 
 
-def _judged(table: Float[np.ndarray, "m s"], most: int, now: int) -> TimeOffset:
+def _is_time(
+    moments: Sequence[Moment],
+    members: Sequence[int],
+    i: int,
+    view_of: Callable[[int, int], View | None],
+    now: int,
+    shift: int,
+) -> bool:
+    """Whether another moment explains more than a small shift of the camera's picture does."""
+    steps = range(-_SHIFT_PX, _SHIFT_PX + 1)
+    scores: dict[tuple[int, int, int], list[float]] = {}
+    for moment in moments:
+        covered = moment.rest_mask(members, i)
+        views = {at: view_of(i, moment.k + at) for at in (now, shift)}
+        if covered is None or None in views.values():
+            continue
+        for down in steps:
+            for right in steps:
+                moved = np.roll(covered, (down, right), axis=(0, 1))
+                for at, view in views.items():
+                    assert view is not None
+                    fit = fit_of_mask(moved, view)
+                    scores.setdefault((at, down, right), []).append(fit.iou - fit.surplus)
+    best = {at: max((float(np.mean(v)) for key, v in scores.items() if key[0] == at), default=0.0)
+            for at in (now, shift)}  # fmt: skip
+    return best[shift] - best[now] > _LEAST_GAIN
+
+
+def _judged(table: Float[np.ndarray, "m s"], most: int, sure: tuple[float, int]) -> TimeOffset:
     counted = np.isfinite(table).sum(axis=0)
     fit = np.where(counted > 0, np.nansum(table, axis=0) / np.maximum(counted, 1), np.nan)
     curve = tuple((s - most, float(f)) for s, f in enumerate(fit) if np.isfinite(f))
-    gain, shift = _gain(table, most, now)
+    gain, shift = sure
     place = shift + most
     # Only moments that have all of them: other moments fit better or worse as a whole.
     around = [p for p in range(place - 2, place + 3) if 0 <= p <= 2 * most]
