@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
-from bodyhull.config import Units, Up
 from bodyhull.errors import OK, UserError
+from bodyhull.recording_choice import RecordingChoice
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -31,31 +31,17 @@ _PARTS, _HELD_OUT_PARTS = 8, (2, 6)
 _MOST_CARVED, _MOST_HULLS, _VOXEL_M = 3, 72, 0.016
 
 
-@dataclass(frozen=True)
-class Refine:
+@dataclass(frozen=True, kw_only=True)
+class Refine(RecordingChoice):
     """Refine where the cameras stand from what the recording shows: the person's outlines, and keypoints if
     there are any. No board is needed."""
 
-    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
-    """Folder of the recording, as `bodyhull run` takes it."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """Rig file (.json) to write; --calibration takes it. Not written where it would not be better."""
     keypoints: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Folder of keypoints, OpenPose's or COCO's; RECORDING/keypoints if that exists."""
     focal: bool = False
     """Refine focal lengths too."""
-    sequence: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Which sequence, where the recording holds several."""
-    calibration: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Calibration to refine instead of the recording's own."""
-    frames: Annotated[str | None, tyro.conf.arg(metavar="START:STOP:STEP")] = None
-    """Which frame numbers; all by default. A few of them are looked at, spread over the time."""
-    units: Units = "auto"
-    """Unit of the calibration's world."""
-    up: Up = "auto"
-    """World axis that points up."""
-    background: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Folder of background plates, <camera>.png, for recordings of videos."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +58,6 @@ class Looked:
 
 def perform_refine(command: Refine) -> int:
     """Refine, print the table, write the rig if it is better on frames that were held out."""
-    from capture.recording import open_recording
     from hull.rig_refinement import refine_pose
 
     if command.out.suffix.lower() != ".json":
@@ -80,15 +65,7 @@ def perform_refine(command: Refine) -> int:
     if command.keypoints is not None and not command.keypoints.is_dir():
         raise UserError(f"--keypoints {command.keypoints}: no such folder")
     started = time.perf_counter()
-    recording = open_recording(
-        command.recording,
-        sequence=command.sequence,
-        calibration=command.calibration,
-        frames=command.frames,
-        units=command.units,
-        up=command.up,
-        background=command.background,
-    )
+    recording = command.opened()
     if len(recording.frame_ids) < 2:
         raise UserError(
             f"{command.recording}: 1 frame chosen; refining needs 2 at least, since some are held out to "

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 import tyro
 
-from bodyhull.config import Units, Up
 from bodyhull.errors import FRAMES_FAILED, OK, UserError
 from bodyhull.folder import write_atomically
+from bodyhull.recording_choice import RecordingChoice
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -22,12 +22,10 @@ if TYPE_CHECKING:
 _MOST_FRAMES = 24
 
 
-@dataclass(frozen=True)
-class World:
+@dataclass(frozen=True, kw_only=True)
+class World(RecordingChoice):
     """Move a recording's calibration to its floor (z up, floor at 0), and scale it to the person's height."""
 
-    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
-    """A recording as `bodyhull run` takes it."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE.json")]
     """Rig file to write; `run --calibration` takes it."""
     floor: Literal["feet", "cameras", "keep"] = "feet"
@@ -37,36 +35,15 @@ class World:
     """Height of the person, metres: the rig is scaled so that the silhouettes' space is as tall."""
     keypoints: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """OpenPose's or COCO's keypoints, as `bodyhull run` takes them."""
-    sequence: str | None = None
-    """Which sequence of the recording."""
-    calibration: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Calibration, if not the recording's own."""
-    frames: Annotated[str | None, tyro.conf.arg(metavar="START:STOP:STEP")] = None
-    """Which frames; 24 of them are looked at."""
-    units: Units = "auto"
-    """Unit of the calibration's world."""
-    up: Up = "auto"
-    """World axis of the calibration that points up."""
-    background: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Plates, for videos."""
 
 
 def perform_world(command: World) -> int:
     """Read, move, write, tell; returns the exit code (3 where the result is doubted)."""
-    from capture.recording import open_recording
     from capture.world_frame import settle_ground
 
     if command.out.is_dir() or command.out.suffix.lower() != ".json":
         raise UserError(f"--out {command.out}: give the name of a .json file")
-    recording = open_recording(
-        command.recording,
-        sequence=command.sequence,
-        calibration=command.calibration,
-        frames=command.frames,
-        units=command.units,
-        up=command.up,
-        background=command.background,
-    )
+    recording = command.opened()
     indices = np.linspace(0, len(recording.frame_ids) - 1, min(_MOST_FRAMES, len(recording.frame_ids)))
     frames = [recording.frame_ids[k] for k in sorted({int(k) for k in indices.round()})]
     wants_masks = command.height_m is not None or (command.floor == "feet" and command.keypoints is None)

@@ -8,31 +8,17 @@ from typing import Annotated
 
 import tyro
 
-from bodyhull.config import Units, Up
 from bodyhull.errors import FRAMES_FAILED, OK
+from bodyhull.recording_choice import RecordingChoice
 
 
-@dataclass(frozen=True)
-class CheckRecording:
+@dataclass(frozen=True, kw_only=True)
+class CheckRecording(RecordingChoice):
     """Look at a recording before running anything: numbers per camera, and a verdict that names what is
     wrong, with which camera, and what to do. Exit code 0: sound; 3: something was found."""
 
-    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
-    """Folder of the recording, as for `bodyhull run`."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Folder for the page (index.html) and the numbers (check.json); <recording>-check here by default."""
-    sequence: str | None = None
-    """Which sequence, where the recording holds several."""
-    calibration: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Calibration to use instead of the recording's own."""
-    frames: Annotated[str | None, tyro.conf.arg(metavar="START:STOP:STEP")] = None
-    """Which frames; all by default."""
-    units: Units = "auto"
-    """Unit of the calibration's world."""
-    up: Up = "auto"
-    """World axis that points up."""
-    background: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Folder of background plates, for videos."""
     sample: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """How many frames to read; by default as many as take about half a minute."""
 

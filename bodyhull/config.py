@@ -42,8 +42,8 @@ class RunConfig:
     """Body model: free:neutral, free:female, free:male, or the path of an .npz or .pkl of SMPL, SMPL-H or
     SMPL-X."""
     calibration: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Calibration to use instead of the recording's own: a .qca.txt file, a rig.json, or a folder of
-    camNN.txt."""
+    """Calibration to use instead of the recording's own: a file or folder in any format that `bodyhull
+    convert` knows."""
     frames: Annotated[str | None, tyro.conf.arg(metavar="START:STOP:STEP")] = None
     """Which frame numbers; all by default."""
     voxel_mm: float = 8.0
