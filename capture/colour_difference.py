@@ -28,7 +28,7 @@ def foreground(picture: Picture, background: Picture) -> UInt8[np.ndarray, "h w"
     return cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)).astype(np.uint8)
 
 
-def shrunk(picture: Picture, scale: float) -> Picture:
+def shrunk(picture: Picture, scale: float) -> UInt8[np.ndarray, "_h _w 3"]:
     """The picture scaled down by area averaging (as it is at scale 1)."""
     if scale >= 1:
         return picture

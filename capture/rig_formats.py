@@ -338,10 +338,12 @@ def _read_inria(folder: Path) -> ForeignRig:
 
 
 def _inria_size(setup: Path, number: int) -> tuple[int, int] | None:
-    """From the first silhouette or picture of that camera beside the setup folder."""
+    """From the first silhouette or picture of that camera beside the folder, or, where it is called setup, in
+    the sequences beside it: whatever else lies around a folder of matrices need not belong to them."""
     root = setup.resolve().parent
+    beside = ("", "*/") if setup.resolve().name.lower() == "setup" else ("",)
     for pictures in ("SilhouettesPictures", "Pictures"):
-        for folder in sorted([*root.glob(f"{pictures}/cam*"), *root.glob(f"*/{pictures}/cam*")]):
+        for folder in sorted(f for where in beside for f in root.glob(f"{where}{pictures}/cam*")):
             digits = re.findall(r"\d+", folder.name)
             if digits and int(digits[-1]) == number and folder.is_dir():
                 first = min((file for file in folder.iterdir() if file.is_file()), default=None)
