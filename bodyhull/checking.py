@@ -26,6 +26,10 @@ from hull.residual import residuals
 # Outlines that lie so many pixels (and this share of the picture's longer side) outside the others' hull,
 # and so many times the typical camera's, are not the silhouettes' doing.
 RESIDUAL_PX, RESIDUAL_SHARE, RESIDUAL_FACTOR = 6.0, 0.006, 2.5
+# What is left of that in a late camera at its own moment, px.
+LATE_PX = 3.0
+# Where fewer of the cameras agree, and one is off, nobody can tell which: the whole rig is to be refined.
+MOST = 0.75
 # A camera that forbids this share of what the others show lacks a part.
 FORBIDDEN = 0.04
 _N_FULL, _N_FULL_LARGE, _LARGE_MP = 4, 2, 100.0
@@ -103,9 +107,13 @@ def check_recording(
     numbers = rig_numbers(opened, facts, found, rig, moments, unit, per_unit, axis)
     outside = residuals(moments, found.members) if found.members else {}
     cameras = camera_numbers(facts, found, rig, outside, moments, axis, numbers)
-    findings = [*opened.findings, *unit_findings, *found.findings]
+    findings = [*opened.findings, *unit_findings, *_without_loose_late(opened, facts, found, moments)]
     findings += _lacking(found, facts)
-    findings += _loose(cameras, findings, facts)
+    loose = _loose(cameras, findings, facts, found)
+    if any(finding.whole_rig for finding in loose):
+        # In a rig that is off another moment may fit better by chance: refined first, it can be asked again.
+        findings = [f for f in findings if f.kind is not FindingKind.UNSYNCHRONISED]
+    findings += loose
     if trouble is not None and not findings:
         findings.append(
             Finding(
@@ -141,6 +149,50 @@ def _without_repeats(findings: Sequence[Finding]) -> list[Finding]:
         seen.add(key)
         kept.append(finding)
     return kept
+
+
+def _without_loose_late(
+    opened: Opened, facts: FrameFacts, found: Examination, moments: Sequence[Moment]
+) -> list[Finding]:
+    """The findings but for late cameras whose outline sticks out at their own moment too, or among cameras of
+    which too few agree: the calibration is off, and another moment fits better by chance."""
+    late = {
+        facts.rig.names.index(finding.cameras[0]): round(finding.numbers["offset_frames"] / facts.usual_step)
+        for finding in found.findings
+        if finding.kind is FindingKind.UNSYNCHRONISED and "offset_frames" in finding.numbers
+    }
+    if not late or not found.members:
+        return list(found.findings)
+    asked = {i for moment in found.moments for i, view in enumerate(moment.views) if view is not None}
+    told = {facts.rig.names.index(name) for f in found.findings if not f.whole_rig for name in f.cameras}
+    if len(asked & (told | set(found.members))) < MOST * len(asked):
+        return [f for f in found.findings if f.kind is not FindingKind.UNSYNCHRONISED]
+    turn = None if found.rig_repair is None else found.rig_repair.turn
+    shifted = []
+    for moment in moments:
+        masks = [None if view is None else view.mask for view in moment.views]
+        for i, n in late.items():
+            k = moment.k + n
+            image = None
+            if 0 <= k < len(facts.frame_ids):
+                image = opened.recording.silhouettes(facts.frame_ids[k]).images[i]
+            masks[i] = None if image is None else _turned(image, turn)
+        again = moment_of(moment.k, moment.cameras, masks)
+        if again is not None:
+            shifted.append(again)
+    outside = residuals(shifted, found.members)
+    limits = {i: max(LATE_PX, RESIDUAL_SHARE * max(facts.rig[i].size)) for i in late}
+    names = {facts.rig.names[i] for i in late if outside.get(i, 0.0) > limits[i]}
+    return [
+        f
+        for f in found.findings
+        if f.kind is not FindingKind.UNSYNCHRONISED or not names.intersection(f.cameras)
+    ]
+
+
+def _limit_px(size: tuple[int, int]) -> float:
+    """How far the outline of a right camera may lie outside the hull of the others."""
+    return max(RESIDUAL_PX, RESIDUAL_SHARE * max(size))
 
 
 def _full_moments(opened: Opened, facts: FrameFacts, found: Examination, rig: Rig) -> list[Moment]:
@@ -221,17 +273,20 @@ def _lacking(found: Examination, facts: FrameFacts) -> list[Finding]:
     ]
 
 
-def _loose(cameras: Sequence[CameraNumbers], findings: Sequence[Finding], facts: FrameFacts) -> list[Finding]:
+def _loose(
+    cameras: Sequence[CameraNumbers], findings: Sequence[Finding], facts: FrameFacts, found: Examination
+) -> list[Finding]:
     """Cameras, or a whole rig, whose outlines stick out though no known mistake explains it."""
     named = {name for finding in findings if not finding.whole_rig for name in finding.cameras}
     told = {c.name: c.residual_px for c in cameras if c.residual_px is not None and c.name not in named}
     if not told:
         return []
-    limits = {c.name: max(RESIDUAL_PX, RESIDUAL_SHARE * max(c.size)) for c in cameras}
+    limits = {c.name: _limit_px(c.size) for c in cameras}
     typical = float(np.median(list(told.values())))
     loose = [name for name, value in told.items() if value > limits[name]]
     refine = "refine the calibration: bodyhull calibrate refine"
-    if len(loose) > 0.5 * len(told) or (loose and len(told) < 5):
+    few_agree = len({facts.rig.names[i] for i in found.trust.members} | named) < MOST * len(cameras)
+    if len(loose) > 0.5 * len(told) or (loose and (few_agree or len(told) < 5)):
         return [
             Finding(
                 FindingKind.CALIBRATION,

@@ -15,6 +15,7 @@ from capture.frame_facts import FrameFacts, scaled_camera
 from capture.layouts import dome_layout
 from capture.rig import Rig
 from capture.still_pictures import frozen_runs
+from render.spoil import displaced_rig
 from tests.capture_scenes import PERSON, ball_mask
 from tests.command_line import call
 
@@ -90,6 +91,16 @@ def test_who_stands_still_tells_no_time_and_raises_no_alarm(tmp_path: Path) -> N
     check = checked(tmp_path, scene)
     assert [camera.offset_frames for camera in check.cameras] == [None] * N_CAMERAS
     assert check.findings == ()
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_rig_that_is_off_as_a_whole_is_not_called_late(tmp_path: Path, seed: int) -> None:
+    off = displaced_rig(filmed().rig, (2.0, 3.0), (0.02, 0.04), seed)
+    check = checked(tmp_path, replace(filmed(), rig=off))
+    assert [(f.kind.value, f.whole_rig) for f in check.findings] == [("calibration off", True)], [
+        f.sentence() for f in check.findings
+    ]
+    assert "bodyhull calibrate refine" in check.findings[0].action
 
 
 def test_the_command_tells_writes_and_returns_a_code(
