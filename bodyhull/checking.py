@@ -181,7 +181,9 @@ def _without_loose_late(
         if again is not None:
             shifted.append(again)
     outside = residuals(shifted, found.members)
-    limits = {i: max(LATE_PX, RESIDUAL_SHARE * max(facts.rig[i].size)) for i in late}
+    # Ragged outlines stick out everywhere.
+    usual = float(np.median([outside[i] for i in found.members if i in outside] or [0.0]))
+    limits = {i: max(LATE_PX, RESIDUAL_SHARE * max(facts.rig[i].size), 2 * usual) for i in late}
     names = {facts.rig.names[i] for i in late if outside.get(i, 0.0) > limits[i]}
     return [
         f

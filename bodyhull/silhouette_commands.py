@@ -37,7 +37,7 @@ class MakeSilhouettes:
     comes back where the picture agrees, or becomes unknown."""
     background: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Empty pictures: <camera>.png, a folder <camera>/ of many, or a film <camera>.mp4. The recording's own
-    background/ if not given; none: the median over time."""
+    background/ if not given; none: the median over time, the person cut out of the film roughly first."""
     key: Annotated[str | None, tyro.conf.arg(metavar="R,G,B")] = None
     """Colour of the screen, 0 to 255 each, where it is not found by itself."""
     calibration: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None

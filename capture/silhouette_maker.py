@@ -19,10 +19,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from capture.background import Backgrounds, build_backgrounds, median_over_time
+from capture.background import Backgrounds, build_backgrounds
 from capture.chroma_key import KeyDifference, find_key, key_of_colour
 from capture.colour_difference import CLEAR_LEVELS, departure, shrunk
 from capture.difference import Difference, Look, full_size
+from capture.emptied_film import emptied
 from capture.errors import RecordingError
 from capture.filmed import Filmed
 from capture.mask_border import refined
@@ -229,8 +230,9 @@ def prepare_maker(filmed: Filmed, options: MakerOptions, report: Report = lambda
         methods.append(used)
     several = filmed.rig is not None and len(filmed.rig) >= 2
     cut = None
-    corrected = methods.count("auto") * 2 > len(methods) and not all(
-        plate.n_frames >= _MANY_EMPTY and camera in filmed.scenes
+    # A single empty picture may be of another light, or have somebody in it; the film says which.
+    corrected = methods.count("auto") * 2 > len(methods) and any(
+        plate.n_frames < _MANY_EMPTY and camera in filmed.scenes
         for camera, plate in zip(filmed.cameras, plates, strict=True)
     )
     if several and method == "auto" and corrected:
@@ -285,7 +287,8 @@ def _plate_of(filmed: Filmed, camera: str, samples: list[int], method: str) -> P
     if scene is not None and method != "median":
         return learn_plate(scene.frames())
     stack = np.stack(list(filmed.frames.read_several(camera, samples)))
-    return median_plate(stack, median_over_time(stack))
+    scene_picture, painted = emptied(stack)
+    return median_plate(painted, scene_picture)
 
 
 def _difference(
