@@ -28,7 +28,6 @@ from bodyhull.checking import Check, check_recording
 from capture.calibration_file import camera_number
 from capture.camera import Camera
 from capture.errors import RecordingError
-from capture.frame_facts import scaled_camera
 from capture.layouts import cage_layout, dome_layout, ring_layout
 from capture.rig import Rig
 from fit.body.model import load_body
@@ -141,8 +140,9 @@ def write_scene(root: Path, scene: Scene) -> Path:
     return root / "setup"
 
 
-Plant = Callable[[Scene, np.random.Generator], "tuple[Scene, str, set[int] | None] | None"]
-"""Scene -> the wrong one, the finding's kind, its cameras (None: the whole rig)."""
+Planted = tuple[Scene, str, set[int] | None]
+"""The wrong scene, the finding's kind, its cameras (None: the whole rig)."""
+Plant = Callable[[Scene, np.random.Generator], Planted | None]
 
 
 def _one(scene: Scene, rng: np.random.Generator, change: Callable[[Camera], Camera]) -> tuple[Scene, int]:
@@ -163,25 +163,25 @@ def _inverse(camera: Camera) -> Camera:
     return replace(camera, camera_from_world=np.linalg.inv(camera.camera_from_world))
 
 
-def units_one(scene: Scene, rng: np.random.Generator):  # type: ignore[no-untyped-def]
+def units_one(scene: Scene, rng: np.random.Generator) -> Planted:
     made, i = _one(scene, rng, _moved(float(rng.choice([1000, 100, 0.001, 0.01]))))
     return made, "units", {i}
 
 
-def units_all(scene: Scene, rng: np.random.Generator):  # type: ignore[no-untyped-def]
+def units_all(scene: Scene, rng: np.random.Generator) -> Planted:
     return _all(scene, _moved(float(rng.choice([1000, 100])))), "units", None
 
 
-def inverted_one(scene: Scene, rng: np.random.Generator):  # type: ignore[no-untyped-def]
+def inverted_one(scene: Scene, rng: np.random.Generator) -> Planted:
     made, i = _one(scene, rng, _inverse)
     return made, "inverted", {i}
 
 
-def inverted_all(scene: Scene, rng: np.random.Generator):  # type: ignore[no-untyped-def]
+def inverted_all(scene: Scene, rng: np.random.Generator) -> Planted:
     return _all(scene, _inverse), "inverted", None
 
 
-def swapped(scene: Scene, rng: np.random.Generator):  # type: ignore[no-untyped-def]
+def swapped(scene: Scene, rng: np.random.Generator) -> Planted:
     i, j = (int(k) for k in rng.choice(len(scene.rig), 2, replace=False))
     order = list(range(len(scene.rig)))
     order[i], order[j] = j, i
@@ -190,13 +190,13 @@ def swapped(scene: Scene, rng: np.random.Generator):  # type: ignore[no-untyped-
     return replace(scene, rig=Rig(cameras)), "swapped", {i, j}
 
 
-def half_one(scene: Scene, rng: np.random.Generator):  # type: ignore[no-untyped-def]
-    made, i = _one(scene, rng, lambda c: scaled_camera(c, 0.5))
+def half_one(scene: Scene, rng: np.random.Generator) -> Planted:
+    made, i = _one(scene, rng, lambda c: c.with_pixels_scaled(0.5, 0.5))
     return _with_half_sizes(made, {i}, rng), "picture_size", {i}
 
 
-def half_all(scene: Scene, rng: np.random.Generator):  # type: ignore[no-untyped-def]
-    made = _all(scene, lambda c: scaled_camera(c, 0.5))
+def half_all(scene: Scene, rng: np.random.Generator) -> Planted:
+    made = _all(scene, lambda c: c.with_pixels_scaled(0.5, 0.5))
     return _with_half_sizes(made, set(range(len(scene.rig))), rng), "picture_size", None
 
 
@@ -210,7 +210,7 @@ def _with_half_sizes(scene: Scene, those: set[int], rng: np.random.Generator) ->
     return replace(scene, json_cameras=cameras)
 
 
-def unsynchronised(scene: Scene, rng: np.random.Generator):  # type: ignore[no-untyped-def]
+def unsynchronised(scene: Scene, rng: np.random.Generator) -> Planted:
     i, late = int(rng.integers(len(scene.rig))), int(rng.choice([-8, -6, -5, -4, -3, -2, 2, 3, 4, 5, 6, 8]))
     return late_by(scene, {i: late}, str(rng.choice(["clamped", "missing", "rolled"]))), "unsynchronised", {i}
 
@@ -229,19 +229,19 @@ def late_by(scene: Scene, frames: dict[int, int], way: str = "missing") -> Scene
     return made
 
 
-def mirrored_one(scene: Scene, rng: np.random.Generator):  # type: ignore[no-untyped-def]
+def mirrored_one(scene: Scene, rng: np.random.Generator) -> Planted:
     i, made = int(rng.integers(len(scene.rig))), scene.copy()
     made.masks[i] = [None if m is None else np.ascontiguousarray(m[:, ::-1]) for m in made.masks[i]]
     return made, "mirrored", {i}
 
 
-def mirrored_pictures(scene: Scene, rng: np.random.Generator):  # type: ignore[no-untyped-def]
+def mirrored_pictures(scene: Scene, rng: np.random.Generator) -> Planted:
     made = scene.copy()
     made.masks = [[None if m is None else np.ascontiguousarray(m[:, ::-1]) for m in r] for r in made.masks]
     return made, "mirrored", None
 
 
-def mirrored_world(scene: Scene, rng: np.random.Generator):  # type: ignore[no-untyped-def]
+def mirrored_world(scene: Scene, rng: np.random.Generator) -> Planted:
     signs = np.ones(4)
     signs[rng.integers(3)] = -1
     if not scene.as_json:
@@ -253,7 +253,7 @@ def mirrored_world(scene: Scene, rng: np.random.Generator):  # type: ignore[no-u
     return replace(scene, json_cameras=cameras), "mirrored", None
 
 
-def stale(scene: Scene, rng: np.random.Generator):  # type: ignore[no-untyped-def]
+def stale(scene: Scene, rng: np.random.Generator) -> Planted:
     i, made = int(rng.integers(len(scene.rig))), scene.copy()
     length = int(rng.integers(5, 16))
     start = int(rng.integers(1, scene.n_frames - length))
@@ -262,7 +262,7 @@ def stale(scene: Scene, rng: np.random.Generator):  # type: ignore[no-untyped-de
     return made, "stale", {i}
 
 
-def dead(scene: Scene, rng: np.random.Generator):  # type: ignore[no-untyped-def]
+def dead(scene: Scene, rng: np.random.Generator) -> Planted:
     i, made = int(rng.integers(len(scene.rig))), scene.copy()
     shape = np.asarray(scene.masks[i][0]).shape
     way = rng.integers(4)

@@ -26,6 +26,7 @@ from benchmarks.hull import machine
 from capture.camera import Camera
 from capture.filmed import open_filmed
 from capture.layouts import ring_layout
+from capture.rig import Rig
 from capture.silhouette_maker import MakerOptions, prepare_maker
 from tests.silhouette_scenes import KINDS, Seen, Source, iou, write_scene
 
@@ -146,7 +147,7 @@ def synthetic(seeds: tuple[int, ...], methods: tuple[str, ...]) -> None:
         print(f"| {kind} | {method} | " + " | ".join(f"{value:.3f}" for value in numbers) + " |", flush=True)
 
 
-def rendered(root: Path, rig, seed: int) -> tuple[Source, Source]:  # type: ignore[no-untyped-def]
+def rendered(root: Path, rig: Rig, seed: int) -> tuple[Source, Source]:
     """A clothed person, alone and with a passer-by 1.3 m behind."""
     from dataclasses import replace
 

@@ -51,7 +51,8 @@ class CameraNumbers:
 class RigNumbers:
     """Of the hull in the middle frame, by the cameras that agree. None: there was none.
 
-    unit, metres_per_unit : of the calibration, as far as told. up : world axis, (3,) or None.
+    unit, metres_per_unit : of the calibration, as far as told. up : world axis, (3,) or None. floor_m : the
+    hull's lowest coordinate along it; camera heights are above that.
     """
 
     n_cameras: int
@@ -63,6 +64,7 @@ class RigNumbers:
     person_height_m: float | None
     volume_l: float | None
     witnesses: float | None
+    floor_m: float | None
     lowest_camera_m: float | None
     highest_camera_m: float | None
     agreeing: tuple[str, ...]
@@ -78,7 +80,7 @@ def rig_numbers(
     per_unit: float,
     axis: np.ndarray | None,
 ) -> RigNumbers:
-    height = volume = witnesses = lowest = highest = None
+    height = volume = witnesses = floor = lowest = highest = None
     if moments and len(found.members) >= 2:
         middle = moments[len(moments) // 2]
         images = [
@@ -108,6 +110,7 @@ def rig_numbers(
         height,
         volume,
         witnesses,
+        floor,
         lowest,
         highest,
         tuple(rig.names[i] for i in found.members),
@@ -124,9 +127,7 @@ def camera_numbers(
     numbers: RigNumbers,
 ) -> list[CameraNumbers]:
     centre = np.median([moment.bounds.centre for moment in moments], axis=0) if moments else None
-    floor = None
-    if axis is not None and centre is not None and numbers.person_height_m is not None:
-        floor = float(centre @ axis) - 0.5 * numbers.person_height_m
+    floor = numbers.floor_m
     made = []
     for i, camera in enumerate(rig):
         fit, offset = found.fits.get(i), found.offsets.get(i)

@@ -36,7 +36,7 @@ def _row(camera: CameraNumbers) -> tuple[str | float | None, ...]:
         f"{camera.size[0]}x{camera.size[1]}",
         f"{camera.field_of_view_deg[0]:.0f} x {camera.field_of_view_deg[1]:.0f}",
         camera.distance_m,
-        None if camera.residual_px is None else round(camera.residual_px, 1),
+        None if camera.residual_px is None else f"{camera.residual_px:.1f}",
         camera.agreement,
         camera.missing,
         camera.surplus,
@@ -136,6 +136,7 @@ def write_check(out: Path, check: Check) -> tuple[Path, Path]:
             ),
             problems=tuple(finding.sentence() for finding in check.findings),
             notes=check.notes,
+            facts_title="The rig",
             facts=rig_facts(check),
             pictures=tuple(pictures),
             tables=(

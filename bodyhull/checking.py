@@ -20,7 +20,7 @@ from capture.preflight import Opened, open_for_check
 from capture.rig import Rig
 from capture.world import settle_world
 from hull.preflight import Examination, examine
-from hull.reference import Moment, moment_of
+from hull.reference import Moment, moment_of, turned
 from hull.residual import residuals
 
 # Outlines that lie so many pixels (and this share of the picture's longer side) outside the others' hull,
@@ -176,14 +176,15 @@ def _without_loose_late(
             image = None
             if 0 <= k < len(facts.frame_ids):
                 image = opened.recording.silhouettes(facts.frame_ids[k]).images[i]
-            masks[i] = None if image is None else _turned(image, turn)
+            masks[i] = turned(image, turn) if image is not None and turn is not None else image
         again = moment_of(moment.k, moment.cameras, masks)
         if again is not None:
             shifted.append(again)
     outside = residuals(shifted, found.members)
     # Ragged outlines stick out everywhere.
     usual = float(np.median([outside[i] for i in found.members if i in outside] or [0.0]))
-    limits = {i: max(LATE_PX, RESIDUAL_SHARE * max(facts.rig[i].size), 2 * usual) for i in late}
+    sizes = opened.recording.rig
+    limits = {i: max(LATE_PX, RESIDUAL_SHARE * max(sizes[i].size), 2 * usual) for i in late}
     names = {facts.rig.names[i] for i in late if outside.get(i, 0.0) > limits[i]}
     return [
         f
@@ -212,7 +213,7 @@ def _full_moments(opened: Opened, facts: FrameFacts, found: Examination, rig: Ri
         images = opened.recording.silhouettes(facts.frame_ids[k]).images
         # Frozen pictures were left out before.
         masks = [
-            None if view is None or image is None else _turned(image, turn)
+            None if view is None or image is None else image if turn is None else turned(image, turn)
             for view, image in zip(shown, images, strict=True)
         ]
         moment = moment_of(k, rig.cameras, masks)
@@ -233,13 +234,6 @@ def _in_metres(moments: Sequence[Moment], rig: Rig) -> list[Moment]:
         if again is not None:
             made.append(again)
     return made
-
-
-def _turned(image: np.ndarray, turn: str | None) -> np.ndarray:
-    if turn is None:
-        return image
-    steps = {"left-right": (1, -1), "upside down": (-1, 1), "by 180 degrees": (-1, -1)}[turn]
-    return np.ascontiguousarray(image[:: steps[0], :: steps[1]])
 
 
 def _world(

@@ -24,9 +24,9 @@ from bodyhull.folder import write_atomically
 from capture.contact_sheet import contact_sheet
 from capture.filmed import Filmed
 from capture.rig import Rig
-from capture.silhouette_files import write_whole
 from capture.silhouette_folder import SilhouetteFolder, folder_numbers
 from capture.silhouette_maker import MakerOptions, SilhouetteMaker, prepare_maker
+from capture.whole_file import write_whole
 
 STATE, SHEET = "silhouettes.json", "silhouettes.jpg"
 AGAIN = "pass --overwrite to make them again, or choose another --out"

@@ -210,6 +210,16 @@ class Camera:
             borderValue=(float(outside),) * 4,
         )
 
+    def with_pixels_scaled(self, across: float, down: float, size: tuple[int, int] | None = None) -> Camera:
+        """The same camera with `across` times as many columns and `down` times as many rows in its pictures,
+        of which `size` (width, height) says how many there are (as before if None)."""
+        # Pixels are counted from their centres, so it is the pictures' corner at -0.5 that stays.
+        change = np.array([[across, 0, 0.5 * across - 0.5], [0, down, 0.5 * down - 0.5], [0, 0, 1.0]])
+        projection = None if self.projection is None else change @ self.projection
+        return replace(
+            self, size=size or self.size, intrinsics=change @ self.intrinsics, projection=projection
+        )
+
     def with_world_scaled(self, factor: float) -> Camera:
         """The same camera in a world whose coordinates are multiplied by `factor` (millimetres to metres:
         1e-3)."""

@@ -5,7 +5,7 @@ empty and repeated pictures; and every mask, small, for what compares cameras an
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -146,21 +146,7 @@ def touches_border(image: UInt8[np.ndarray, "h w"]) -> bool:
 def small_camera(camera: Camera, shrink: int) -> Camera:
     """The camera as pictures see it of which `shrink` x `shrink` pixels were made one."""
     width, height = camera.size
-    return scaled_camera(camera, 1 / shrink, (-(-width // shrink), -(-height // shrink)))
-
-
-def scaled_camera(camera: Camera, factor: float, size: tuple[int, int] | None = None) -> Camera:
-    """The pinhole whose pictures have `factor` times as many pixels each way; `size`: unchanged if None."""
-    # Whole pixels are counted from their centres, so the picture's corner at -0.5 stays where it is.
-    change = np.array([[factor, 0, 0.5 * factor - 0.5], [0, factor, 0.5 * factor - 0.5], [0, 0, 1.0]])
-    projection = camera.projection
-    return replace(
-        camera,
-        size=camera.size if size is None else size,
-        intrinsics=change @ camera.intrinsics,
-        distortion=np.zeros(0),
-        projection=None if projection is None else change @ projection,
-    )
+    return camera.with_pixels_scaled(1 / shrink, 1 / shrink, (-(-width // shrink), -(-height // shrink)))
 
 
 def _packed(

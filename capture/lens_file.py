@@ -17,6 +17,7 @@ from jaxtyping import Float
 from capture.camera import Camera
 from capture.errors import RecordingError
 from capture.rig import Rig
+from capture.whole_file import write_whole
 
 _FORMAT = "bodyhull-lenses"
 _VERSION = 1
@@ -52,9 +53,7 @@ def save_lenses(path: Path, lenses: list[Lens]) -> None:
             for lens in lenses
         ],
     }
-    part = path.with_name(path.name + ".part")
-    part.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    part.replace(path)
+    write_whole(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 
 
 def load_lenses(path: Path) -> list[Lens]:

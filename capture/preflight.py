@@ -18,14 +18,12 @@ from typing import Any
 import numpy as np
 
 from capture.calibration_file import Calibration, PictureSizeError, read_calibration
-from capture.camera import Camera
 from capture.errors import RecordingError
 from capture.finding import Finding, FindingKind
 from capture.frame_choice import choose_frames
-from capture.frame_facts import scaled_camera
 from capture.image_sequence import ImageFolders, ImageSequence, choose_sequence, find_images, find_inverted
 from capture.projection_split import camera_from_projection
-from capture.recording import Recording, gap_notes, own_sequence
+from capture.recording import Recording, gap_notes, own_calibration, own_sequence
 from capture.rig import Rig
 from capture.silhouettes import FrameSource
 from capture.video_sequence import (
@@ -153,7 +151,7 @@ def _found_images(root: Path, sequence: str | None, calibration: Path | None, fr
     return _Found(
         name,
         images.sizes,
-        calibration or root / "setup",
+        calibration or own_calibration(root),
         frame_ids,
         images,
         find_inverted(images),
@@ -207,17 +205,13 @@ def _read_calibration(found: _Found) -> tuple[Calibration, list[Finding]]:
     cameras = []
     for camera in read.rig:
         if camera.name in wrong:
-            cameras.append(_for_pictures(camera, found.sizes[camera.name]))
+            size = found.sizes[camera.name]
+            factor = size[0] / camera.size[0]
+            cameras.append(camera.with_pixels_scaled(factor, factor, size))
         else:
             cameras.append(camera)
     findings += _size_findings(found.sizes, wrong, names)
     return replace(read, rig=Rig(tuple(cameras))), findings
-
-
-def _for_pictures(camera: Camera, size: tuple[int, int]) -> Camera:
-    """The camera scaled to pictures of another size; lens distortion, which knows no pixels, is kept."""
-    scaled = scaled_camera(camera, size[0] / camera.size[0], size)
-    return replace(scaled, distortion=camera.distortion)
 
 
 def _size_findings(

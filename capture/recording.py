@@ -167,7 +167,7 @@ def _open_images(
     root, sequence = own_sequence(root, sequence, calibration_path)
     name, folder = choose_sequence(root, sequence)
     images = find_images(name, folder)
-    calibration_path = calibration_path or _own_calibration(root)
+    calibration_path = calibration_path or own_calibration(root)
     calibration = read_calibration(calibration_path, images.sizes)
     inverted = find_inverted(images)
     probe = ImageSequence(images, calibration.rig, inverted)
@@ -199,7 +199,7 @@ def _open_images(
     return _recording(name, calibration, world, chosen, notes, ImageSequence(images, delivered, inverted))
 
 
-def _own_calibration(root: Path) -> Path:
+def own_calibration(root: Path) -> Path:
     """`setup/`, or the one calibration that lies there, in `calibration/` or beside them.
 
     A JSON file beside them must be called rig.json: other programs leave theirs there too.

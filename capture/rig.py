@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from capture.camera import Camera
 from capture.errors import RecordingError
+from capture.whole_file import write_whole
 
 _FORMAT = "bodyhull-rig"
 _VERSION = 1
@@ -58,11 +59,7 @@ class Rig:
 
     def save(self, path: Path | str) -> None:
         """Write as JSON; the poses must be in metres by then. Appears whole or not at all."""
-        path = Path(path)
-        text = json.dumps(self.to_json(), indent=1, allow_nan=False)
-        part = path.with_name(path.name + ".part")
-        part.write_text(text + "\n", encoding="utf-8")
-        part.replace(path)
+        write_whole(Path(path), (json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n").encode())
 
     def to_json(self) -> dict[str, Any]:
         """Plain lists and numbers; Python writes floats so that they read back to the last bit."""

@@ -86,13 +86,7 @@ def resized(rig: Rig, width_px: int) -> Rig:
 def _resized(camera: Camera, width_px: int) -> Camera:
     scale = width_px / camera.size[0]
     size = (width_px, max(round(camera.size[1] * scale), 1))
-    # (0, 0) is the centre of the first pixel, so it is the pixels' corner, half a pixel off, that scales.
-    pixels = np.array(
-        [[scale, 0, 0.5 * scale - 0.5], [0, size[1] / camera.size[1], 0.5 * size[1] / camera.size[1] - 0.5]]
-    )
-    stretched = np.vstack([pixels, [0, 0, 1]])
-    given = None if camera.projection is None else stretched @ camera.projection
-    return replace(camera, size=size, intrinsics=stretched @ camera.intrinsics, projection=given)
+    return camera.with_pixels_scaled(scale, size[1] / camera.size[1], size)
 
 
 def _seen_from(camera: Camera, world_from_upright: Float[np.ndarray, "4 4"]) -> Camera:

@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from capture.camera import Camera
 from capture.rig import Rig
 from capture.silhouette_files import PERSON
-from capture.world import closest_point
+from capture.world import find_subject
 
 Masks = Sequence[UInt8[np.ndarray, "_h _w"] | None]
 
@@ -49,8 +49,7 @@ def _inside_all(rig: Rig, masks: Masks) -> tuple[Float[np.ndarray, "n 3"], float
     used = [(camera, mask) for camera, mask in used if (mask == PERSON).any()]
     if len(used) < 2:
         return None
-    rays = [_middle_ray(camera, mask) for camera, mask in used]
-    middle, _ = closest_point(np.array([ray[0] for ray in rays]), np.array([ray[1] for ray in rays]))
+    middle, _ = find_subject(rig, masks)
     half = max(_half_size(camera, mask, middle) for camera, mask in used)
     low, high = middle - half, middle + half
     points, step = np.zeros((0, 3)), 0.0
@@ -74,14 +73,6 @@ def _inside_all(rig: Rig, masks: Masks) -> tuple[Float[np.ndarray, "n 3"], float
             return None
         low, high = points.min(axis=0) - 1.5 * step, points.max(axis=0) + 1.5 * step
     return points, step
-
-
-def _middle_ray(
-    camera: Camera, mask: UInt8[np.ndarray, "h w"]
-) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
-    rows, columns = np.nonzero(mask == PERSON)
-    origin, directions = camera.rays(np.array([[columns.mean(), rows.mean()]]))
-    return origin, directions[0]
 
 
 def _half_size(camera: Camera, mask: UInt8[np.ndarray, "h w"], middle: Float[np.ndarray, " 3"]) -> float:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Shaped, UInt8
 
 from capture.camera import Camera
+from capture.whole_file import write_whole
 
 PERSON, BACKGROUND, UNKNOWN = 255, 0, 128
 # Person and background swapped, unknown kept.
@@ -74,17 +75,6 @@ def write_silhouette(path: Path, mask: UInt8[np.ndarray, "h w"]) -> None:
     done, data = cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, 3])
     assert done
     write_whole(path, data.tobytes())
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write under a temporary name beside `path`, then rename. OSError where it cannot be written."""
-    part = path.with_name(f".{path.name}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(content)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def png_damage(content: bytes) -> str | None:

@@ -27,8 +27,8 @@ from capture.silhouette_files import (
     png_size,
     undistort_silhouette,
     write_silhouette,
-    write_whole,
 )
+from capture.whole_file import write_whole
 
 _RIG = "rig.json"
 

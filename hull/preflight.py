@@ -12,14 +12,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import UInt8
 
 from capture.finding import Finding, FindingKind
 from capture.frame_facts import FrameFacts
 from capture.still_pictures import FrozenRun, frozen_runs
 from hull.moments_verdict import frozen_cameras, late_cameras, silent_cameras
-from hull.reference import NO_FIT, Fit, Moment, moment_of, normalising_scale
+from hull.reference import NO_FIT, Fit, Moment, moment_of, normalising_scale, turned
 from hull.repairs import Repair, best_for_rig, camera_repairs, fits_with_pictures_of, likely_for_rig, repaired
-from hull.time_offsets import MOST_FRAMES, TimeOffset, time_offsets
+from hull.time_offsets import MOST_FRAMES, MaskOf, TimeOffset, time_offsets
 from hull.trust import (
     EXPLAINED,
     Trust,
@@ -79,7 +80,7 @@ def examine(facts: FrameFacts) -> Examination:
     runs = frozen_runs(facts)
     frozen = {(run.camera_idx, k) for run in runs for k in range(run.first + 1, run.last + 1)}
 
-    def mask_of(i: int, k: int):  # type: ignore[no-untyped-def]
+    def mask_of(i: int, k: int) -> UInt8[np.ndarray, "_h _w"] | None:
         if not 0 <= k < len(facts.frame_ids) or (i, k) in frozen:
             return None
         return facts.mask(i, k)
@@ -125,8 +126,8 @@ def examine(facts: FrameFacts) -> Examination:
         members = list(trust.members)
     offsets: dict[int, TimeOffset] = {}
     if len(facts.frame_ids) >= _FEWEST_FRAMES:
-        turned = _turned_masks(mask_of, rig_repair)
-        offsets = time_offsets(moments, members, asked, turned, _reach(facts))
+        shown = _turned_masks(mask_of, rig_repair)
+        offsets = time_offsets(moments, members, asked, shown, _reach(facts))
     named: set[int] = set()
     if len(asked) >= _FEWEST_TO_JUDGE:
         for finding, those in _explained(facts, moments, members, fits, offsets, suspects, asked):
@@ -149,17 +150,17 @@ def _reach(facts: FrameFacts) -> int:
     return int(np.clip(len(facts.frame_ids) // 2 - 1, 1, MOST_FRAMES))
 
 
-def _turned_masks(mask_of, repair: Repair | None):  # type: ignore[no-untyped-def]
+def _turned_masks(mask_of: MaskOf, repair: Repair | None) -> MaskOf:
     """Masks as the repair of the whole rig leaves them."""
-    if repair is None or repair.turn is None:
+    way = None if repair is None else repair.turn
+    if way is None:
         return mask_of
-    steps = {"left-right": (1, -1), "upside down": (-1, 1), "by 180 degrees": (-1, -1)}[repair.turn]
 
-    def turned(i: int, k: int):  # type: ignore[no-untyped-def]
+    def turned_mask_of(i: int, k: int) -> UInt8[np.ndarray, "_h _w"] | None:
         mask = mask_of(i, k)
-        return None if mask is None else np.ascontiguousarray(mask[:: steps[0], :: steps[1]])
+        return None if mask is None else turned(mask, way)
 
-    return turned
+    return turned_mask_of
 
 
 def _moments_to_ask(facts: FrameFacts, runs: Sequence[FrozenRun]) -> list[int]:

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from capture.camera import Camera
 from capture.rig import Rig
-from capture.world import closest_point, find_subject, subject_extent
+from capture.world import find_subject, subject_extent
 from hull.bounds import Bounds
 from hull.carve import carve
 from hull.coverage import Coverage
@@ -38,6 +38,12 @@ N_PARTS, _PARTED_FROM = 12, 24
 # A strip along the outline, so many pixels wide, sticks out for many small reasons.
 _RIM_PX = 2
 _RIM = np.ones((2 * _RIM_PX + 1, 2 * _RIM_PX + 1), np.uint8)
+
+
+def turned(mask: UInt8[np.ndarray, "h w"], way: str) -> UInt8[np.ndarray, "h w"]:
+    """The mask flipped "left-right" or "upside down", or turned "by 180 degrees"."""
+    steps = {"left-right": (1, -1), "upside down": (-1, 1), "by 180 degrees": (-1, -1)}[way]
+    return np.ascontiguousarray(mask[:: steps[0], :: steps[1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +68,8 @@ class View:
         return View(mask, person, core, known, int(person.sum()), int(core.sum()))
 
     def turned(self, way: str) -> View:
-        """The picture "left-right", "upside down", or "by 180 degrees"."""
-        steps = {"left-right": (1, -1), "upside down": (-1, 1), "by 180 degrees": (-1, -1)}[way]
-        return View.of(np.ascontiguousarray(self.mask[:: steps[0], :: steps[1]]))
+        """The picture as `turned` leaves it."""
+        return View.of(turned(self.mask, way))
 
 
 @dataclass(frozen=True)
@@ -151,7 +156,9 @@ def moment_of(
         None if view is None else prepare_table(camera, view.mask, i)
         for i, (camera, view) in enumerate(zip(cameras, views, strict=True))
     )
-    return Moment(k, tuple(cameras), views, tables, _around(cameras, views))
+    # A person's surroundings where the lines through the silhouettes' middles come closest.
+    middle, _ = find_subject(Rig(tuple(cameras)), [None if view is None else view.mask for view in views])
+    return Moment(k, tuple(cameras), views, tables, Bounds(middle - _REACH_M, middle + _REACH_M))
 
 
 def normalising_scale(cameras: Sequence[Camera], masks: Sequence[UInt8[np.ndarray, "_h _w"] | None]) -> float:
@@ -161,19 +168,6 @@ def normalising_scale(cameras: Sequence[Camera], masks: Sequence[UInt8[np.ndarra
     if extent is None or _PERSON_M[0] < extent < _PERSON_M[1] or not np.isfinite(extent) or extent <= 0:
         return 1.0
     return _USUAL_M / extent
-
-
-def _around(cameras: Sequence[Camera], views: Sequence[View | None]) -> Bounds:
-    """A person's surroundings where the lines through the silhouettes' middles come closest."""
-    origins, ways = [], []
-    for camera, view in zip(cameras, views, strict=True):
-        if view is not None:
-            rows, columns = np.nonzero(view.person)
-            origin, way = camera.rays(np.array([[columns.mean(), rows.mean()]]))
-            origins.append(origin)
-            ways.append(way[0])
-    middle, _ = closest_point(np.array(origins), np.array(ways))
-    return Bounds(middle - _REACH_M, middle + _REACH_M)
 
 
 def fit_of(hull: Coverage | None, camera: Camera, view: View) -> Fit:

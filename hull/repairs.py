@@ -13,7 +13,6 @@ import numpy as np
 
 from capture.camera import Camera
 from capture.finding import FindingKind
-from capture.frame_facts import scaled_camera
 from capture.projection_split import camera_from_projection
 from hull.reference import (
     Fit,
@@ -65,11 +64,6 @@ def _inverted(camera: Camera) -> Camera:
     return replace(camera, camera_from_world=np.linalg.inv(camera.camera_from_world), projection=None)
 
 
-def _mirrored_world(camera: Camera) -> Camera:
-    matrix = camera.projection_matrix @ np.diag([-1.0, 1, 1, 1])
-    return camera_from_projection(camera.name, camera.size, matrix)
-
-
 def _mirrored_by(axis: int) -> Callable[[Camera], Camera]:
     signs = np.ones(4)
     signs[axis] = -1
@@ -85,7 +79,7 @@ def _placed(ratio: float) -> Callable[[Camera], Camera]:
 
 
 def _enlarged(ratio: float) -> Callable[[Camera], Camera]:
-    return lambda camera: scaled_camera(camera, ratio)
+    return lambda camera: camera.with_pixels_scaled(ratio, ratio)
 
 
 def _part(ratio: float) -> str:
@@ -211,7 +205,7 @@ def whole_rig_repairs() -> list[Repair]:
         FindingKind.MIRRORED,
         "the world is mirrored: every camera is left-handed, with the person behind it",
         "negate one world axis (one of columns 1 to 3 of every matrix)",
-        _mirrored_world,
+        _mirrored_by(0),  # whichever axis: a mirrored world turned about is a mirrored world
     )
     turns = [
         replace(

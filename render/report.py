@@ -61,9 +61,9 @@ class ReportData:
 
     title; subtitle: a sentence; headline: the few (name, value) that matter most, shown large; problems: a
     sentence each, what went wrong or was found odd (empty: the page says so); facts: (name, value) of the
-    run; pictures: wide ones, one under the other; tables; sheet_headers and sheet: the contact sheet; films:
-    (caption, path relative to the report's folder) of MP4 files; notes: a sentence each, what was settled
-    without a doubt.
+    run, under facts_title; pictures: wide ones, one under the other; tables; sheet_headers and sheet: the
+    contact sheet; films: (caption, path relative to the report's folder) of MP4 files; notes: a sentence
+    each, what was settled without a doubt.
     """
 
     title: str
@@ -71,6 +71,7 @@ class ReportData:
     headline: tuple[tuple[str, str], ...] = ()
     problems: tuple[str, ...] = ()
     facts: tuple[tuple[str, str], ...] = ()
+    facts_title: str = "The run"
     pictures: tuple[Image, ...] = ()
     tables: tuple[Table, ...] = ()
     sheet_headers: tuple[str, ...] = ()

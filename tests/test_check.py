@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from benchmarks.preflight import PLANTS, Scene, late_by, told_by, write_scene
-from bodyhull.checking import check_recording
-from capture.frame_facts import FrameFacts, scaled_camera
+from bodyhull.checking import Check, check_recording
+from capture.frame_facts import FrameFacts
 from capture.layouts import dome_layout
 from capture.rig import Rig
 from capture.still_pictures import frozen_runs
@@ -41,7 +41,7 @@ def filmed() -> Scene:
     return Scene(rig, masks, "balls", as_json=True)
 
 
-def checked(folder: Path, scene: Scene):  # type: ignore[no-untyped-def]
+def checked(folder: Path, scene: Scene) -> Check:
     return check_recording(folder, calibration=write_scene(folder, scene))
 
 
@@ -139,11 +139,22 @@ def test_the_command_tells_writes_and_returns_a_code(
 def test_what_cannot_be_looked_at_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert call(capsys, "check", tmp_path / "nowhere").complaint == f"{tmp_path / 'nowhere'}: no such folder"
     assert "no recording here" in call(capsys, "check", tmp_path).complaint
-    write_scene(tmp_path, filmed())
-    complaint = call(capsys, "check", tmp_path).complaint
-    assert complaint.startswith(f"{tmp_path / 'setup'}: no such calibration")
-    said = call(capsys, "check", tmp_path, "--calibration", tmp_path / "rig.json", "--sample", 2)
+    recording = tmp_path / "recording"
+    recording.mkdir()
+    rig = write_scene(recording, filmed()).rename(tmp_path / "elsewhere.json")
+    complaint = call(capsys, "check", recording, "--out", tmp_path / "out").complaint
+    assert complaint.startswith(f"{recording / 'setup'}: no such calibration")
+    said = call(capsys, "check", recording, "--calibration", rig, "--sample", 2)
     assert "--sample 2: give 3 frames or more" in said.complaint
+
+
+def test_a_recordings_own_calibration_is_found_as_a_run_finds_it(tmp_path: Path) -> None:
+    where = write_scene(tmp_path, filmed())
+    assert where.name == "rig.json"
+    assert check_recording(tmp_path, at_most=12).findings == ()
+    (tmp_path / "calibration").mkdir()
+    where.rename(tmp_path / "calibration" / "cameras.json")
+    assert check_recording(tmp_path, at_most=12).findings == ()
 
 
 def test_a_calibrated_camera_without_pictures_is_told(tmp_path: Path) -> None:
@@ -201,7 +212,7 @@ def test_a_run_of_equal_pictures_counts_only_while_others_move() -> None:
 
 def test_a_camera_for_smaller_pictures_sees_the_same() -> None:
     camera = filmed().rig[0]
-    half = scaled_camera(camera, 0.5)
+    half = camera.with_pixels_scaled(0.5, 0.5)
     points = np.array([[0.1, 0.2, 1.0], [-0.3, 0.1, 0.4]])
     corner, half_corner = camera.project(points)[0] + 0.5, half.project(points)[0] + 0.5
     np.testing.assert_allclose(half_corner, corner / 2, atol=1e-9)

@@ -72,8 +72,8 @@ FIELDS = {
     "fit.fuse.FusionShape": "template betas joints spread fit_scale",
     "fit.track.TrackedFrame": "frame_id state distance_m status message",
     "fit.body.pose_prior.PosePrior": "mean covariance",
-    "render.report.ReportData": "title subtitle headline problems facts pictures tables sheet_headers sheet "
-    "films",
+    "render.report.ReportData": "title subtitle headline problems facts facts_title pictures tables "
+    "sheet_headers sheet films",
     "bodyhull.config.RunConfig": "recording out sequence body calibration frames voxel_mm units up "
     "background keypoints overwrite pose_prior colours",
 }
