@@ -116,7 +116,7 @@ def settle_convention(rig: Rig, frames: Sequence[Masks]) -> Settled:
     doubts, settled = [], []
     if best is not given:
         doubts.append(
-            f"The matrices count pixels otherwise: {_described(best.convention)}. So the outlines agree to "
+            f"The matrices count pixels otherwise: {described(best.convention)}. So the outlines agree to "
             f"{best.miss_px:.2g} px, as given to {given.miss_px:.2g} px; they were converted."
         )
     found = best.convention
@@ -287,7 +287,8 @@ def _peak(values: Float[np.ndarray, " o"]) -> float | None:
     return None if bend > -1e-3 else float(-slope / (2 * bend))
 
 
-def _described(convention: Convention) -> str:
+def described(convention: Convention) -> str:
+    """What a file does otherwise, in words; nothing for what is as ours."""
     parts = [] if convention.axes == "as given" else [convention.axes]
     if convention.factor != 1:
         times = 1 / convention.factor

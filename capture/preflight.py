@@ -18,12 +18,13 @@ from typing import Any
 import numpy as np
 
 from capture.calibration_file import Calibration, PictureSizeError, read_calibration
+from capture.convention import Convention, Settled, described, settle_convention
 from capture.errors import RecordingError
 from capture.finding import Finding, FindingKind
 from capture.frame_choice import choose_frames
 from capture.image_sequence import ImageFolders, ImageSequence, choose_sequence, find_images, find_inverted
 from capture.projection_split import camera_from_projection
-from capture.recording import Recording, gap_notes, own_calibration, own_sequence
+from capture.recording import Recording, gap_notes, own_calibration, own_sequence, probed_masks
 from capture.rig import Rig
 from capture.silhouettes import FrameSource
 from capture.video_sequence import (
@@ -122,7 +123,13 @@ def open_for_check(
         )
     notes += length_notes(found.videos) if is_video else []
     if found.images is not None:
-        notes += gap_notes(ImageSequence(found.images, read.rig, found.inverted), found.frame_ids)
+        probe = ImageSequence(found.images, read.rig, found.inverted)
+        notes += gap_notes(probe, found.frame_ids)
+        if read.leaves_open:
+            pixels = settle_convention(read.rig, probed_masks(probe, found.frame_ids))
+            read = replace(read, rig=pixels.rig)
+            findings += _pixel_findings(pixels)
+            notes += pixels.settled
     findings += _without_pictures(read.notes)
     per_unit = METRES_PER_UNIT[declared] if declared else 1.0
     axis = UP_AXES["z" if up == "auto" else up].copy()
@@ -225,6 +232,25 @@ def _size_findings(
     if len(wrong) == len(names) and len({told(name) for name in wrong}) == 1:
         return [Finding(FindingKind.PICTURE_SIZE, names, told(names[0]), action, whole_rig=True)]
     return [Finding(FindingKind.PICTURE_SIZE, (name,), told(name), action) for name in wrong]
+
+
+def _pixel_findings(pixels: Settled) -> list[Finding]:
+    """Matrices that are for other pictures than these, in a way that a run undoes."""
+    convention = pixels.convention
+    if (convention.axes, convention.factor) == (Convention.axes, Convention.factor):
+        return []
+    kind = FindingKind.MIRRORED if convention.factor == Convention.factor else FindingKind.PICTURE_SIZE
+    return [
+        Finding(
+            kind,
+            pixels.rig.names,
+            f"the matrices are for other pictures: {described(convention)}",
+            "`bodyhull run` undoes that; if it is not how they were meant, look at pictures and calibration, "
+            "else write them anew with `bodyhull convert`",
+            whole_rig=True,
+            numbers={"axes": convention.axes, "ratio": convention.factor},
+        )
+    ]
 
 
 def _without_pictures(notes: tuple[str, ...]) -> list[Finding]:

@@ -27,7 +27,7 @@ from capture.video_sequence import (
     length_notes,
     read_plates,
 )
-from capture.world import World, settle_world
+from capture.world import Masks, World, settle_world
 
 __all__ = ["Recording", "RecordingError", "Silhouettes", "open_recording"]
 
@@ -172,19 +172,15 @@ def _open_images(
     inverted = find_inverted(images)
     probe = ImageSequence(images, calibration.rig, inverted)
     chosen = choose_frames(probe.frame_ids, frames)
-    probed = sorted(
-        (probe.silhouettes(frame) for frame in sorted({chosen[0], chosen[len(chosen) // 2]})),
-        key=lambda found: -sum(image is not None for image in found.images),
-    )
-    first = probed[0]
+    probed = probed_masks(probe, chosen)
     told: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
     if calibration.leaves_open:
-        pixels = settle_convention(calibration.rig, [found.images for found in probed])
+        pixels = settle_convention(calibration.rig, probed)
         calibration, doubts, told = replace(calibration, rig=pixels.rig), pixels.doubts, pixels.settled
     world = settle_world(
         calibration.rig,
-        first.images,
+        probed[0],
         declared_unit=calibration.unit,
         units=units,
         up=up,
@@ -197,6 +193,14 @@ def _open_images(
     notes += gap_notes(probe, chosen)
     delivered = calibration.rig.with_world_scaled(world.metres_per_unit)
     return _recording(name, calibration, world, chosen, notes, ImageSequence(images, delivered, inverted))
+
+
+def probed_masks(source: ImageSequence, frame_ids: tuple[int, ...]) -> list[Masks]:
+    """Silhouettes of one or two frames to learn from, the fuller ones first."""
+    found = [
+        source.silhouettes(frame).images for frame in sorted({frame_ids[0], frame_ids[len(frame_ids) // 2]})
+    ]
+    return sorted(found, key=lambda images: -sum(image is not None for image in images))
 
 
 def own_calibration(root: Path) -> Path:

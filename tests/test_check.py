@@ -13,6 +13,7 @@ from benchmarks.preflight import PLANTS, Scene, late_by, told_by, write_scene
 from bodyhull.checking import Check, check_recording
 from capture.frame_facts import FrameFacts
 from capture.layouts import dome_layout
+from capture.recording import open_recording
 from capture.rig import Rig
 from capture.still_pictures import frozen_runs
 from render.spoil import displaced_rig
@@ -155,6 +156,22 @@ def test_a_recordings_own_calibration_is_found_as_a_run_finds_it(tmp_path: Path)
     (tmp_path / "calibration").mkdir()
     where.rename(tmp_path / "calibration" / "cameras.json")
     assert check_recording(tmp_path, at_most=12).findings == ()
+
+
+def test_matrices_that_a_run_converts_are_told_and_nothing_else(tmp_path: Path) -> None:
+    scene = replace(filmed(), as_json=False)
+    height = scene.rig[0].size[1]
+    flip = np.array([[1.0, 0, 0], [0, -1, height - 1], [0, 0, 1]])
+    scene.matrices = [flip @ camera.projection_matrix for camera in scene.rig]
+    write_scene(tmp_path, scene)
+    check = check_recording(tmp_path, at_most=12, units="m")
+    assert [(f.kind.value, f.whole_rig) for f in check.findings] == [("mirrored", True)]
+    assert "rows counted from the bottom" in check.findings[0].text
+    assert "`bodyhull run` undoes that" in check.findings[0].action
+    ours = open_recording(tmp_path, units="m").rig
+    assert max(c.residual_px or 0.0 for c in check.cameras) < 1.5
+    for camera, same in zip(check.facts.rig, ours, strict=True):
+        np.testing.assert_allclose(camera.centre, same.centre, atol=1e-9)
 
 
 def test_a_calibrated_camera_without_pictures_is_told(tmp_path: Path) -> None:
