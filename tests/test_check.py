@@ -1,5 +1,6 @@
 """`bodyhull check`: planted faults are named with their camera, sound recordings are called sound."""
 
+import itertools
 import json
 from dataclasses import replace
 from functools import lru_cache
@@ -16,6 +17,7 @@ from capture.layouts import dome_layout
 from capture.recording import open_recording
 from capture.rig import Rig
 from capture.still_pictures import frozen_runs
+from hull import moments_verdict
 from render.spoil import displaced_rig
 from tests.capture_scenes import PERSON, ball_mask
 from tests.command_line import call
@@ -73,6 +75,21 @@ def test_a_dead_camera_is_named(tmp_path: Path, way: str) -> None:
     assert [(f.kind.value, f.cameras) for f in check.findings] == [("dead camera", ("cam-002",))], [
         f.sentence() for f in check.findings
     ]
+
+
+@pytest.mark.parametrize("first_black", [0, N_FRAMES // 2])
+def test_a_camera_that_sees_the_person_at_times_is_dead_if_it_never_shows_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, first_black: int
+) -> None:
+    """In a third of the frames without a silhouette most of the others' hull lies in its picture."""
+    scene = filmed().copy()
+    for k in range(first_black, N_FRAMES):
+        scene.masks[2][k] = np.zeros_like(scene.masks[2][0])
+    asked = itertools.count()
+    monkeypatch.setattr(moments_verdict, "_would_see", lambda *_: 0.9 if next(asked) % 3 == 0 else 0.1)
+    check = checked(tmp_path, scene)
+    expected = [("dead camera", ("cam-002",))] if first_black == 0 else []
+    assert [(f.kind.value, f.cameras) for f in check.findings] == expected
 
 
 def test_time_offsets_of_several_cameras_are_exact(tmp_path: Path) -> None:
